@@ -4,7 +4,7 @@ import os
 
 import pytest
 
-from torchcloth._utils.files import atomically, write_text
+from torchcloth._utils.files import write_atomically, write_text
 
 
 def test_an_interrupt_while_writing_leaves_the_old_text(tmp_path, monkeypatch):
@@ -18,7 +18,7 @@ def test_an_interrupt_while_writing_leaves_the_old_text(tmp_path, monkeypatch):
 
 def test_a_block_that_fails_leaves_nothing(tmp_path):
     def half():
-        with atomically(tmp_path / "new" / "a.npz") as part:
+        with write_atomically(tmp_path / "new" / "a.npz") as part:
             part.write_bytes(b"half")
             raise ValueError("no")
 
@@ -36,7 +36,7 @@ def test_the_systems_errors_name_the_file_that_was_asked_for(tmp_path):
 
 def test_the_suffix_is_kept(tmp_path):
     """Libraries choose the format by it, and some add their own where there is none."""
-    with atomically(tmp_path / "a.npz") as part:
+    with write_atomically(tmp_path / "a.npz") as part:
         assert part.suffix == ".npz"
         part.write_bytes(b"whole")
     assert (tmp_path / "a.npz").read_bytes() == b"whole"

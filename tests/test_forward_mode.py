@@ -1,4 +1,4 @@
-"""``real_tangents``: same values and tangents, and the reason why it exists."""
+"""``dense_tangents``: same values and tangents, and the reason why it exists."""
 
 import time
 from contextlib import nullcontext
@@ -8,7 +8,7 @@ import torch
 import torch.autograd.forward_ad as forward_ad
 
 import torchcloth as tc
-from torchcloth._utils.forward_mode import real_tangents
+from torchcloth._utils.forward_mode import dense_tangents
 
 OPERATIONS = {
     "mul": torch.mul,
@@ -25,7 +25,7 @@ SHAPES = [((4, 3), (4, 3)), ((5, 4, 3), (4, 1)), ((4, 1), (5, 4, 3)), ((4, 3), (
 
 
 def evaluate(operation, a, b, tangent_a, tangent_b, inside):
-    with forward_ad.dual_level(), real_tangents() if inside else nullcontext():
+    with forward_ad.dual_level(), dense_tangents() if inside else nullcontext():
         a = a if tangent_a is None else forward_ad.make_dual(a, tangent_a)
         b = b if tangent_b is None else forward_ad.make_dual(b, tangent_b)
         out = forward_ad.unpack_dual(operation(a, b))
@@ -96,7 +96,7 @@ def test_operands_are_left_as_they_were():
     a, b = torch.randn(4, 3), torch.randn(4, 3)
     with forward_ad.dual_level():
         dual = forward_ad.make_dual(a, torch.ones_like(a))
-        with real_tangents():
+        with dense_tangents():
             dual * b
         assert forward_ad.unpack_dual(b).tangent is None
 
@@ -116,9 +116,9 @@ def test_is_needed():
                 rounds.append(time.perf_counter() - start)
         return min(rounds)
 
-    plain, inside = seconds(nullcontext()), seconds(real_tangents())
+    plain, inside = seconds(nullcontext()), seconds(dense_tangents())
     if plain < 40e-6 * 60 and plain < 3 * inside:
-        pytest.skip(f"torch {torch.__version__} multiplies mixed operands fast by itself: real_tangents can be retired")
+        pytest.skip(f"torch {torch.__version__} multiplies mixed operands fast by itself: dense_tangents can be retired")
     assert plain > 3 * inside
 
 

@@ -7,7 +7,7 @@ import torch
 import torchcloth as tc
 from torchcloth.engine.library import library
 from torchcloth.errors import InvalidInput
-from torchcloth.losses import chamfer_to_surface, chamfer_to_vertices, closest, residuals
+from torchcloth.losses import chamfer_to_surface, chamfer_to_vertices, find_closest_points, residuals
 from torchcloth.losses import nearest as search
 from torchcloth.losses.surface import _find_boundary
 from torchcloth.testing import check_gradients
@@ -49,20 +49,20 @@ def test_closest_points_against_trimesh(vertices, points):
     corners = vertices[FACES].numpy()
     every = [triangles.closest_point(corners, p.expand(len(corners), 3).numpy()) for p in points]
     distance = torch.stack([(torch.as_tensor(on) - p).norm(dim=-1).min() for on, p in zip(every, points, strict=True)])
-    hits = closest(points, vertices, FACES)
-    torch.testing.assert_close((points - hits.on(vertices)).norm(dim=-1), distance, rtol=1e-10, atol=1e-12)
+    hits = find_closest_points(points, vertices, FACES)
+    torch.testing.assert_close((points - hits.interpolate(vertices)).norm(dim=-1), distance, rtol=1e-10, atol=1e-12)
 
 
 def test_faces_that_are_written_to_or_made_in_inference_have_their_own_rim(vertices):
     """Which edges are open is remembered by the faces."""
     faces, beyond = FACES.clone(), vertices.mean(0) + torch.tensor([1.0, 0.0, 0.0])
-    assert bool(closest(beyond[None], vertices, faces).beyond)
+    assert bool(find_closest_points(beyond[None], vertices, faces).is_beyond_edge)
     with torch.inference_mode():
-        assert bool(closest(beyond[None], vertices, FACES + 0).beyond)
-    alone = closest(vertices[faces[0]].mean(0)[None], vertices, faces)
+        assert bool(find_closest_points(beyond[None], vertices, FACES + 0).is_beyond_edge)
+    alone = find_closest_points(vertices[faces[0]].mean(0)[None], vertices, faces)
     faces[1:] = faces[0]  # all edges are of many triangles: none is open
-    assert not bool(closest(beyond[None], vertices, faces).beyond)
-    assert not bool(alone.beyond)
+    assert not bool(find_closest_points(beyond[None], vertices, faces).is_beyond_edge)
+    assert not bool(alone.is_beyond_edge)
 
 
 def test_closest_points_on_triangles_of_all_sizes(points):
@@ -73,8 +73,8 @@ def test_closest_points_on_triangles_of_all_sizes(points):
     corners = torch.rand(200, 1, 3) * 0.5 + size * torch.randn(200, 3, 3)
     every = [triangles.closest_point(corners.numpy(), p.expand(200, 3).numpy()) for p in points]
     distance = torch.stack([(torch.as_tensor(on) - p).norm(dim=-1).min() for on, p in zip(every, points, strict=True)])
-    hits = closest(points, corners.flatten(0, 1), torch.arange(600).view(200, 3))
-    torch.testing.assert_close((points - hits.on(corners.flatten(0, 1))).norm(dim=-1), distance, rtol=1e-9, atol=1e-12)
+    hits = find_closest_points(points, corners.flatten(0, 1), torch.arange(600).view(200, 3))
+    torch.testing.assert_close((points - hits.interpolate(corners.flatten(0, 1))).norm(dim=-1), distance, rtol=1e-9, atol=1e-12)
 
 
 def test_closest_points_against_dense_sampling(vertices, points):
@@ -84,17 +84,17 @@ def test_closest_points_against_dense_sampling(vertices, points):
     weights = torch.stack([i, j, 10 - i - j], dim=-1)[i + j <= 10].double() / 10
     samples = torch.einsum("sc,fcd->fsd", weights, vertices[FACES]).reshape(-1, 3)
     sampled = torch.cdist(points, samples).min(-1).values
-    exact = (points - closest(points, vertices, FACES).on(vertices)).norm(dim=-1)
+    exact = (points - find_closest_points(points, vertices, FACES).interpolate(vertices)).norm(dim=-1)
     assert bool((exact <= sampled + 1e-12).all())
     assert float((sampled - exact).max()) < 0.1 * 0.11
 
 
 def test_weights_are_barycentric_and_chunks_change_nothing(vertices, points):
-    hits = closest(points, vertices, FACES)
+    hits = find_closest_points(points, vertices, FACES)
     assert float(hits.weights.min()) >= 0
     torch.testing.assert_close(hits.weights.sum(-1), torch.ones(len(points)))
     for chunk in (1, 1000):
-        again = closest(points, vertices, FACES, chunk=chunk)
+        again = find_closest_points(points, vertices, FACES, chunk=chunk)
         assert all(torch.equal(a, b) for a, b in zip(again, hits, strict=True))
 
 
@@ -103,7 +103,7 @@ def test_weights_are_barycentric_and_chunks_change_nothing(vertices, points):
 def test_both_searches_find_the_same_places(vertices, points, dtype):
     """Of two triangles that share the place, rounding decides."""
     points, corners = points.to(dtype), vertices.to(dtype)[FACES]
-    found = search.nearest(points, corners, 10**6), search._closest(points, corners)
+    found = search.find_nearest_triangles(points, corners, 10**6), search._closest(points, corners)
     one, other = ((weights[..., None] * corners[face]).sum(1) for face, weights in found)
     torch.testing.assert_close(one, other, rtol=0, atol=20 * torch.finfo(dtype).eps)
     assert float((found[0][0] == found[1][0]).double().mean()) > 0.9
@@ -115,12 +115,12 @@ def test_no_place_is_near_to_what_is_not_finite(vertices, points):
             given = [points.clone(), vertices.clone()]
             given[which][0, 1] = number
             with pytest.raises(InvalidInput, match="points or vertices; got NaN"):
-                closest(*given, FACES)
+                find_closest_points(*given, FACES)
 
 
 def test_two_precisions_are_refused(vertices, points):
     with pytest.raises(InvalidInput, match="expected one precision"):
-        closest(points.float(), vertices, FACES)
+        find_closest_points(points.float(), vertices, FACES)
 
 
 NOT_POINTS = {
@@ -136,7 +136,7 @@ NOT_POINTS = {
 @pytest.mark.parametrize("shape", NOT_POINTS)
 def test_what_is_not_points_is_refused(vertices, points, shape):
     wrong = NOT_POINTS[shape](points)
-    for ask in (closest, chamfer_to_surface, lambda p, x, _: chamfer_to_vertices(p, x)):
+    for ask in (find_closest_points, chamfer_to_surface, lambda p, x, _: chamfer_to_vertices(p, x)):
         with pytest.raises(InvalidInput, match=r"points; got shape .*expected \[N, 3\] in metres"):
             ask(wrong, vertices, FACES)
         with pytest.raises(InvalidInput, match=r"vertices; got shape .*expected \[N, 3\] in metres"):
@@ -155,7 +155,7 @@ def test_faces_do_not_index_time(vertices, points, frames):
     ids=["none", "one", "edges", "floats", "flags", "bytes", "below", "above"],
 )
 def test_what_is_not_triangles_of_the_vertices_is_refused(vertices, points, faces):
-    for ask in (closest, chamfer_to_surface):
+    for ask in (find_closest_points, chamfer_to_surface):
         with pytest.raises(InvalidInput, match="faces; got"):
             ask(points, vertices, faces)
 
@@ -164,13 +164,13 @@ def test_no_points_have_no_mean_distance_and_hit_nothing(vertices, points):
     for distance in (lambda p: chamfer_to_surface(p, vertices, FACES), lambda p: chamfer_to_vertices(p, vertices)):
         with pytest.raises(InvalidInput, match=r"points; got .* N >= 1"):
             distance(points[:0])
-    assert all(len(part) == 0 for part in closest(points[:0], vertices, FACES))
+    assert all(len(part) == 0 for part in find_closest_points(points[:0], vertices, FACES))
 
 
 def test_a_triangle_without_an_edge_is_as_near_as_its_place(vertices, points):
     bare = vertices[FACES].clone()
     bare[0, 1] = bare[0, 0]
-    face, weights = search.nearest(points, bare, 10**6)
+    face, weights = search.find_nearest_triangles(points, bare, 10**6)
     assert bool(weights.isfinite().all())
     place = (weights[..., None] * bare[face]).sum(1)
     assert float((points - place).norm(dim=1).max()) < 0.2
@@ -182,8 +182,8 @@ def test_beyond_a_vertex_of_the_rim_is_beyond(order):
     corners = [[-0.1, 0, 0], [0.1, 0, 0], [0, 0.1, 0], [0, -0.1, 0], [-0.02, 0.04, 0], [-0.02, -0.04, 0]]
     faces = torch.tensor([[1, 4, 5], [1, 2, 4], [1, 5, 3], [2, 0, 4], [0, 3, 5], [0, 5, 4]])[order]
     x, point = torch.tensor(corners, dtype=torch.float64), torch.tensor([[0.12, 0.0, 0.0]], dtype=torch.float64)
-    hits = closest(point, x, faces)
-    assert bool(hits.beyond)
+    hits = find_closest_points(point, x, faces)
+    assert bool(hits.is_beyond_edge)
     assert float(residuals(point, x, hits)[1]) == pytest.approx(0.02)
 
 
@@ -196,26 +196,26 @@ def test_residuals_of_a_flat_sheet():
         [0.33, 0.24, 0.0],  # beyond the corner by (0.03, 0.04)
         [0.15, 0.07, 0.01],  # above an inner edge: not beyond
     ])  # fmt: skip
-    hits = closest(points, flat, FACES)
+    hits = find_closest_points(points, flat, FACES)
     along, beside = residuals(points, flat, hits)
     torch.testing.assert_close(along, torch.tensor([0.01, -0.02, 0.03, 0.0, 0.01]), rtol=0, atol=1e-15)
     torch.testing.assert_close(beside, torch.tensor([0.0, 0.0, 0.04, 0.05, 0.0]), rtol=0, atol=1e-15)
-    assert hits.beyond.tolist() == [False, False, True, True, False]
+    assert hits.is_beyond_edge.tolist() == [False, False, True, True, False]
 
 
 def test_points_beyond_pull_the_edge_outwards_and_points_inside_do_not_pull_it_back():
     flat = torch.as_tensor(MESH.vertices).clone().requires_grad_()
     outside, inside = torch.tensor([[0.34, 0.07, 0.0]]), torch.tensor([[0.25, 0.07, 0.0]])
-    _, beside = residuals(outside, flat, closest(outside, flat, FACES))
+    _, beside = residuals(outside, flat, find_closest_points(outside, flat, FACES))
     (gradient,) = torch.autograd.grad(beside.sum(), flat)
     assert float(gradient[:, 0].sum()) == pytest.approx(-1.0)  # moving the edge out by 1 shortens the distance by 1
-    along, beside = residuals(inside, flat, closest(inside, flat, FACES))
+    along, beside = residuals(inside, flat, find_closest_points(inside, flat, FACES))
     (gradient,) = torch.autograd.grad((along + beside).sum(), flat)
     assert float(gradient[:, :2].abs().max()) == 0.0
 
 
 def test_derivatives_of_residuals_with_hits_held(vertices, points):
-    hits = closest(points, vertices, FACES)
+    hits = find_closest_points(points, vertices, FACES)
 
     def both(vertices, points):
         return torch.cat(residuals(points, vertices, hits))
@@ -244,7 +244,7 @@ def test_chamfer_distances_of_points_on_the_sheet(vertices):
 def test_residuals_have_finite_gradients_inside_the_sheet(vertices):
     x = vertices.clone().requires_grad_()
     points = vertices[FACES].mean(1)
-    along, beside = residuals(points, x, closest(points, vertices, FACES))
+    along, beside = residuals(points, x, find_closest_points(points, vertices, FACES))
     (gradient,) = torch.autograd.grad((along + beside).sum(), x)
     assert bool(torch.isfinite(gradient).all())
 
@@ -254,7 +254,7 @@ def test_residuals_have_finite_gradients_on_the_edge(point):
     """Exactly on the rim or straight above it: the distance beside the sheet is zero."""
     flat = torch.as_tensor(MESH.vertices).clone().requires_grad_()
     points = torch.tensor([point])
-    along, beside = residuals(points, flat, closest(points, flat, FACES))
+    along, beside = residuals(points, flat, find_closest_points(points, flat, FACES))
     (gradient,) = torch.autograd.grad((along + beside).sum(), flat)
     assert float(beside.detach()) == 0.0
     assert bool(torch.isfinite(gradient).all())
@@ -281,7 +281,7 @@ def test_arrays_are_taken_as_recordings_and_meshes_hold_them():
     wanted = chamfer_to_surface(torch.as_tensor(cloud), x, torch.as_tensor(mesh.faces))
     assert torch.equal(chamfer_to_surface(cloud, x, mesh.faces), wanted)
     assert torch.equal(chamfer_to_surface(cloud, mesh.vertices, mesh.faces), wanted)
-    hits = closest(cloud, mesh.vertices, mesh.faces)
+    hits = find_closest_points(cloud, mesh.vertices, mesh.faces)
     found, expected = residuals(cloud, mesh.vertices, hits), residuals(torch.as_tensor(cloud), x, hits)
     assert all(map(torch.equal, found, expected))
     assert torch.equal(chamfer_to_vertices(cloud, x), chamfer_to_vertices(torch.as_tensor(cloud), x))
@@ -305,7 +305,7 @@ def test_edges_of_large_meshes_have_numbers_of_their_own():
 def test_a_triangle_without_area_gives_no_nan():
     x = torch.tensor([[0.0, 0, 0], [1, 0, 0], [2, 0, 0], [0, 1, 0]], dtype=torch.float64, requires_grad=True)
     faces, point = torch.tensor([[0, 1, 2]]), torch.tensor([[0.5, 0.0, 0.2]], dtype=torch.float64)
-    along, beside = residuals(point, x, closest(point, x, faces))
+    along, beside = residuals(point, x, find_closest_points(point, x, faces))
     (along.sum() + beside.sum()).backward()
     assert torch.isfinite(along).all()
     assert torch.isfinite(beside).all()

@@ -55,8 +55,8 @@ __all__ = [
     "robots",
 ]
 
-ROOMS = ("diagnosis", "identification", "observe", "planning", "pose", "recordings", "robots")
-VERBS = {
+LAZY_SUBPACKAGES = ("diagnosis", "identification", "observe", "planning", "pose", "recordings", "robots")
+LAZY_FUNCTIONS = {
     "diagnose": "diagnosis",
     "estimate_pose": "pose",
     "identify": "identification",
@@ -71,8 +71,8 @@ def __dir__() -> list[str]:
 
 def __getattr__(name: str):
     """Rooms that are opened when they are first asked for: importing the layer stays cheap."""
-    if name in ROOMS:
+    if name in LAZY_SUBPACKAGES:
         return import_module(f".{name}", __name__)
-    if name in VERBS:
-        return getattr(import_module(f".{VERBS[name]}", __name__), name)
+    if name in LAZY_FUNCTIONS:
+        return getattr(import_module(f".{LAZY_FUNCTIONS[name]}", __name__), name)
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -12,13 +12,14 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from ._utils.torch_modes import undisturbed
+from ._utils.torch_modes import disable_autocast
 from .boundaries import AbstractBoundary
 from .dynamics import substep
 from .dynamics.contact import Contact, Grid
-from .dynamics.elasticity import MATERIAL, inverse_growth
-from .dynamics.model import Geometry, Model, vertex_mass
-from .dynamics.stability import check_precision, limits_of
+from .dynamics.elasticity import MATERIAL_MEMORY_KEY, inverse_rest_deformation
+from .dynamics.kinematics import Geometry, vertex_mass
+from .dynamics.model import Model
+from .dynamics.stability import check_precision, stability_limits
 from .effects import AbstractEffect
 from .engine.cuda_graphs import Graphs
 from .engine.dispatch import TRIED, Choice, Setting, Trial, check_setting, choose, still_drives
@@ -40,13 +41,13 @@ from .simulation.argument_checks import (
     check_step,
     check_substeps,
     check_times,
-    doubts,
+    mesh_warnings,
     expand_state,
 )
-from .simulation.bound_modules import Parts, check_free
-from .simulation.initial_state import damped, first_state, held, likeness, pressed, stopped
-from .simulation.rollout import Plan, divided, run
-from .simulation.sensitivities import Directions, sensitivities
+from .simulation.bound_modules import BoundModuleDict, check_not_bound_elsewhere
+from .simulation.initial_state import with_mass_damping, initial_state, stationary_motion, template_state, random_contact_state, require_at_rest
+from .simulation.rollout import RolloutSchedule, subdivide_intervals, run_schedule
+from .simulation.sensitivities import Directions, compute_sensitivities
 from .types import ClothState, Rollout, Trajectory
 
 
@@ -73,10 +74,10 @@ class Cloth(nn.Module):
     _corners: Tensor
     _gradient: Tensor
     _area: Tensor
-    _share: Tensor
+    _vertex_area: Tensor
     _points: Tensor
     _vertices: Tensor
-    _apart: Tensor | None
+    _non_adjacent: Tensor | None
 
     def __init__(
         self,
@@ -100,14 +101,14 @@ class Cloth(nn.Module):
         check_field("areal_density", self.areal_density.raw, len(mesh.faces))
         check_fields(effects, len(mesh.faces))
         check_axes(mesh, {"material": material, **{f"effects.{name}": effect for name, effect in effects.items()}})
-        check_free(mesh, [*effects.items(), *boundaries.items()])
-        self.effects, self.boundaries = Parts("effects", mesh), Parts("boundaries", mesh)
+        check_not_bound_elsewhere(mesh, [*effects.items(), *boundaries.items()])
+        self.effects, self.boundaries = BoundModuleDict("effects", mesh), BoundModuleDict("boundaries", mesh)
         self.effects.update(effects)
         self.boundaries.update(boundaries)
         check_grasps(dict(self._parts()), self.boundaries)
-        self._contact, self._grid = contact, None if contact is None else contact.grid(mesh)
-        of_contact = () if self._grid is None else self._grid.doubts(mesh)
-        for doubt in (*doubts(mesh, self.areal_density.value), *of_contact):
+        self._contact, self._grid = contact, None if contact is None else contact.build_grid(mesh)
+        of_contact = () if self._grid is None else self._grid.contact_warnings(mesh)
+        for doubt in (*mesh_warnings(mesh, self.areal_density.value), *of_contact):
             warnings.warn(doubt, stacklevel=2)
         self._store_geometry()
         for own in (*self.parameters(), *self.buffers()):  # tensors keep their precision until a cloth has one
@@ -121,10 +122,10 @@ class Cloth(nn.Module):
             "_corners": torch.as_tensor(self.mesh.faces.T.ravel().copy()),
             "_gradient": torch.as_tensor(gradient, dtype=dtype),
             "_area": torch.as_tensor(area, dtype=dtype).unsqueeze(-1),
-            "_share": torch.as_tensor(self.mesh.vertex_area, dtype=dtype).unsqueeze(-1),
+            "_vertex_area": torch.as_tensor(self.mesh.vertex_area, dtype=dtype).unsqueeze(-1),
             "_vertices": torch.tensor(self.mesh.vertices, dtype=dtype),
             "_points": torch.zeros(0, 3, dtype=dtype) if self._grid is None else self._grid.points,
-            "_apart": None if self._grid is None else self._grid.apart,
+            "_non_adjacent": None if self._grid is None else self._grid.non_adjacent,
         }
         for name, tensor in arrays.items():
             self.register_buffer(name, tensor, persistent=False)
@@ -149,28 +150,28 @@ class Cloth(nn.Module):
 
         A device is tried at the first call, after which this may say that the reference serves.
         """
-        with torch.no_grad(), undisturbed():
+        with torch.no_grad(), disable_autocast():
             model, _ = self._stepping()
-            return str(self._choice(model, likeness(model, self._vertices)))
+            return str(self._choice(model, template_state(model, self._vertices)))
 
     # -- states ---------------------------------------------------------------------------------------------------
 
-    @undisturbed()
+    @disable_autocast()
     def rest_state(self) -> ClothState:
         """The mesh as it was given, at rest."""
         return self.state(self._vertices.clone())  # what a caller does to it is not done to the cloth
 
-    @undisturbed()
+    @disable_autocast()
     def state(self, x: Tensor, v: Tensor | None = None) -> ClothState:
         """A state from vertex positions [..., V, 3] m and velocities (None: at rest), directors along the normals."""
         check_precision(self._area.dtype)
         x = as_positions("x", x, self._area)
         v = torch.zeros_like(x) if v is None else as_positions("v", v, x)
-        return first_state(self.model(), x, v)
+        return initial_state(self.build_model(), x, v)
 
     # -- simulation -----------------------------------------------------------------------------------------------
 
-    @undisturbed()
+    @disable_autocast()
     def forward(
         self,
         state: ClothState,
@@ -194,9 +195,9 @@ class Cloth(nn.Module):
             UnstableStep: ``dt`` beyond the stability limit, or a limit so low that the simulation would never end.
             SimulationDiverged: the state lost finiteness.
         """
-        return run(self.plan(state, motion or {}, times, dt), checkpoint)
+        return run_schedule(self.schedule(state, motion or {}, times, dt), checkpoint)
 
-    @undisturbed()
+    @disable_autocast()
     def settle(
         self,
         state: ClothState,
@@ -219,8 +220,8 @@ class Cloth(nn.Module):
             duration: simulated time [s].
             rate: of the mass damping that is added meanwhile [1/s].
         """
-        settled = run(self.settling(state, motion or {}, start, duration, rate), checkpoint=True).state
-        return stopped(settled, duration, level=3)
+        settled = run_schedule(self.schedule_settling(state, motion or {}, start, duration, rate), checkpoint=True).state
+        return require_at_rest(settled, duration, level=3)
 
     def sensitivities(
         self,
@@ -250,7 +251,7 @@ class Cloth(nn.Module):
         Raises:
             InvalidInput: directions that do not fit, and as ``forward``.
         """
-        return sensitivities(self, state, motion or {}, times, along, dt, settle)
+        return compute_sensitivities(self, state, motion or {}, times, along, dt, settle)
 
     def clip_(self) -> None:
         """Take amplitudes that an optimiser's step has made negative back to zero; call it after every step."""
@@ -258,15 +259,15 @@ class Cloth(nn.Module):
             if isinstance(part, PhysicalParameter):
                 part.clip_()
 
-    @undisturbed()
+    @disable_autocast()
     def stable_step(self) -> float:
         """The substep [s] that is used by default, from the stiffest element and the present parameters."""
         return self._stepping()[1]
 
-    def model(self) -> Model:
+    def build_model(self) -> Model:
         """The parts with their parameters resolved to tensors, as ``functional`` takes them."""
-        geometry = Geometry.of(self._corners, self._gradient, self._area)
-        mass = vertex_mass(geometry, self.areal_density.value, self._share)
+        geometry = Geometry.from_shape_gradients(self._corners, self._gradient, self._area)
+        mass = vertex_mass(geometry, self.areal_density.value, self._vertex_area)
         effects = {name: (effect, effect.coefficients()) for name, effect in self._parts()}
         for effect, c in effects.values():
             extra = effect.mass(c)
@@ -279,20 +280,20 @@ class Cloth(nn.Module):
             coefficients=self.material.coefficients(),
             effects=effects,
             boundaries=dict(self.boundaries.items()),  # type: ignore[arg-type]
-            grid=self.grid(),
-            rest=inverse_growth(effect.growth(c) for effect, c in effects.values()),
+            grid=self.contact_grid(),
+            inverse_rest_deformation=inverse_rest_deformation(effect.rest_deformation(c) for effect, c in effects.values()),
         )
 
-    @undisturbed()
+    @disable_autocast()
     def energy(self, state: ClothState) -> dict[str, Tensor]:
         """Energies by name, each [...] J."""
-        model = self.model()
-        check_state(state, likeness(model, self._vertices), finite=False)
+        model = self.build_model()
+        check_state(state, template_state(model, self._vertices), finite=False)
         return substep.energy(model, state)
 
-    def plan(
+    def schedule(
         self, state: ClothState, motion: Mapping[str, Trajectory], times: Tensor | Sequence[float], dt: float | None
-    ) -> Plan:
+    ) -> RolloutSchedule:
         """What ``forward`` does, checked."""
         frames = check_times(times)
         motion = check_motions(motion, self.boundaries, frames, self._area)
@@ -301,12 +302,12 @@ class Cloth(nn.Module):
         counts = [max(1, int(np.ceil((end - start) / limit - 1e-9))) for start, end in pairwise(frames)]
         return self._ready(model, state, motion, frames, counts, dt=dt)
 
-    def settling(
+    def schedule_settling(
         self, state: ClothState, motion: Mapping[str, Trajectory], start: float, duration: float, rate: float
-    ) -> Plan:
+    ) -> RolloutSchedule:
         """What ``settle`` does, checked."""
         frames = [start, start + duration]
-        motion = check_motions(held(motion, *frames), self.boundaries, frames, self._area)
+        motion = check_motions(stationary_motion(motion, *frames), self.boundaries, frames, self._area)
         model, step = self._stepping()
         check_rate(rate)
         check_substeps(duration, 1 / (1 / step + rate))
@@ -318,17 +319,17 @@ class Cloth(nn.Module):
     def _parts(self) -> Iterable[tuple[str, AbstractEffect]]:
         return cast("Iterable[tuple[str, AbstractEffect]]", self.effects.items())
 
-    def grid(self) -> Grid | None:
+    def contact_grid(self) -> Grid | None:
         """The contact grid; None without contact."""
-        return None if self._grid is None else self._grid._replace(points=self._points, apart=self._apart)
+        return None if self._grid is None else self._grid._replace(points=self._points, non_adjacent=self._non_adjacent)
 
     def _stepping(self, dt: float | None = None) -> tuple[Model, float]:
         """The parts, with the stages that the step needs, and the step [s]: the stable one, or the user's."""
         check_parameters(self)
-        model = self.model()
-        limits = limits_of(model, self._gradient)
-        step = check_step(dt, limits.step)
-        return model._replace(stages=limits.stages(step)), step
+        model = self.build_model()
+        limits = stability_limits(model, self._gradient)
+        step = check_step(dt, limits.cheapest_step)
+        return model._replace(stages=limits.stages_for(step)), step
 
     def _ready(
         self,
@@ -339,27 +340,27 @@ class Cloth(nn.Module):
         counts: list[int],
         settling: float | None = None,
         dt: float | None = None,
-    ) -> Plan:
-        check_state(state, likeness(model, self._vertices))
+    ) -> RolloutSchedule:
+        check_state(state, template_state(model, self._vertices))
         if settling is not None:
-            model = damped(model, settling)
+            model = with_mass_damping(model, settling)
         state = expand_state(state, model, motion)
-        longest = float("inf") if self._grid is None else self._grid.longest
+        longest = float("inf") if self._grid is None else self._grid.max_extent
         steps = [(end - start) / count for (start, end), count in zip(pairwise(frames), counts, strict=True)]
         choice, step_for, asked = self._choice(model, state, min(steps, default=None)), None, None
-        if MATERIAL in state.memory:
-            frames, counts, asked = divided(frames, counts)
+        if MATERIAL_MEMORY_KEY in state.memory:
+            frames, counts, asked = subdivide_intervals(frames, counts)
             step_for = self._step_for(model, dt)
         graphs = Graphs(model, sum(counts)) if choice.captured else None
-        plan = Plan(model, motion, frames, counts, state, choice, longest, step_for, asked, graphs)
-        plan.check(state)
+        plan = RolloutSchedule(model, motion, frames, counts, state, choice, longest, step_for, asked, graphs)
+        plan.check_extent(state)
         return plan
 
     def _step_for(self, model: Model, dt: float | None) -> Callable[[ClothState], float]:
         """The longest substep [s] for a state, as what has set shortens it; the user's is held to it."""
 
         def longest(state: ClothState) -> float:
-            limit = limits_of(model, self._gradient, state.memory[MATERIAL].detach()).longest(model.stages)
+            limit = stability_limits(model, self._gradient, state.memory[MATERIAL_MEMORY_KEY].detach()).stable_step(model.stages)
             return check_step(dt, limit)
 
         return longest
@@ -368,15 +369,15 @@ class Cloth(nn.Module):
         """``dt``: of the substeps [s]; None: there will be none."""
         trial = None
         if dt is not None:
-            trial = Trial(partial(pressed, model, self._vertices, TRIED * dt / 2), dt / 2)
+            trial = Trial(partial(random_contact_state, model, self._vertices, TRIED * dt / 2), dt / 2)
         return choose(self.engine, model, state, still_drives(model), trial)
 
     def extra_repr(self) -> str:
         """Data sheet: size, contact, step."""
         size = f"{len(self.mesh.vertices)} vertices, {len(self.mesh.faces)} triangles, {self.mesh.area.sum():.4g} m^2"
-        if (pieces := self.mesh.pieces) > 1:
+        if (pieces := self.mesh.piece_count) > 1:
             size += f", {pieces} pieces that nothing joins"
-        grid = "none" if self._grid is None else self._grid.words
+        grid = "none" if self._grid is None else self._grid.summary
         try:
             step, engine = f"{self.stable_step():.3g} s", self.engine_in_use
         except TorchclothError as error:  # of a cloth that cannot be simulated, which one prints to see why

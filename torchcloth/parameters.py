@@ -10,7 +10,7 @@ import torch
 from torch import Tensor, nn
 from torch.func import functional_call
 
-from ._utils.vectors import check_value
+from ._utils.vectors import check_has_no_gradient
 from .errors import InvalidInput
 
 Domain = Literal["positive", "unit_half", "nonnegative", "real"]
@@ -68,20 +68,20 @@ class PhysicalParameter(nn.Module):
         *,
         name: str = "parameter",
         axes: int = 1,
-        within: tuple[float, float] | None = None,
+        bounds: tuple[float, float] | None = None,
     ) -> None:
         super().__init__()
         if domain not in _DOMAINS:
             raise InvalidInput("domain", got=repr(domain), expected=f"one of {sorted(_DOMAINS)}")
         self.unit, self.label, self.axes = unit, name, axes
         self.domain: Domain = domain
-        self._interval = _DOMAINS[domain] if within is None else _Interval.between(*within)
+        self._interval = _DOMAINS[domain] if bounds is None else _Interval.between(*bounds)
         self.raw = nn.Parameter(self._to_raw(value))
 
     @property
     def value(self) -> Tensor:
         """Physical value in ``unit``, differentiable with respect to ``raw``."""
-        return to_value(self.raw, self.domain)
+        return to_physical(self.raw, self.domain)
 
     @property
     def field(self) -> Tensor:
@@ -91,7 +91,7 @@ class PhysicalParameter(nn.Module):
 
     def set(self, value: float | Tensor) -> None:
         """Assign a physical value in place; refuses an illegal one and leaves the old value."""
-        check_value(self.label, value)
+        check_has_no_gradient(self.label, value)
         with torch.no_grad():
             new = self._to_raw(value, self.raw.dtype).to(self.raw)
             if new.shape != self.raw.shape:
@@ -100,7 +100,7 @@ class PhysicalParameter(nn.Module):
                 )
             self.raw.copy_(new)
 
-    def check(self, name: str, remedy: str) -> None:
+    def check_in_domain(self, name: str, remedy: str) -> None:
         """Refuse what a step of an optimiser may have brought where values are stored as they are.
 
         Raises:
@@ -120,7 +120,7 @@ class PhysicalParameter(nn.Module):
             self.raw.clamp_(min=0.0)
 
     def _to_raw(self, value: float | Tensor, dtype: torch.dtype | None = None) -> Tensor:
-        check_value(self.label, value)
+        check_has_no_gradient(self.label, value)
         try:
             tensor = torch.as_tensor(value, dtype=None if isinstance(value, Tensor) else torch.float64).detach().clone()
         except (TypeError, ValueError, RuntimeError) as error:
@@ -145,7 +145,7 @@ class PhysicalParameter(nn.Module):
         return f"{shown} {self.unit}"
 
 
-def called(module: nn.Module, values: Mapping[str, Tensor], arguments: tuple) -> Any:
+def call_with_parameters(module: nn.Module, values: Mapping[str, Tensor], arguments: tuple) -> Any:
     """``module(*arguments)`` with these in the place of its parameters.
 
     Ties are left alone: torch would replace the parameters of a part that a cloth has twice, and not put them back.
@@ -153,7 +153,7 @@ def called(module: nn.Module, values: Mapping[str, Tensor], arguments: tuple) ->
     return functional_call(module, dict(values), arguments, tie_weights=False)
 
 
-def to_value(raw: Tensor, domain: Domain) -> Tensor:
+def to_physical(raw: Tensor, domain: Domain) -> Tensor:
     """Map the stored number(s) to the physical value(s)."""
     if domain == "positive":
         return raw.exp()

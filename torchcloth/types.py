@@ -11,7 +11,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-RATES = ("contact",)  # internal variables that are velocities
+VELOCITY_MEMORY_KEYS = ("contact",)  # internal variables that are velocities
 Memory = dict[str, Tensor]  # internal variables by owner, "material" or "effects.NAME": [..., N, K] each
 
 
@@ -31,9 +31,9 @@ class ClothState(NamedTuple):
         memory = {name: function(value) for name, value in self.memory.items()}
         return ClothState(function(self.x), function(self.v), function(self.d3), memory)
 
-    def stopped(self) -> ClothState:
+    def at_rest(self) -> ClothState:
         """The state without any velocity, of which rest has none."""
-        memory = {name: torch.zeros_like(own) if name in RATES else own for name, own in self.memory.items()}
+        memory = {name: torch.zeros_like(own) if name in VELOCITY_MEMORY_KEYS else own for name, own in self.memory.items()}
         return self._replace(v=torch.zeros_like(self.v), memory=memory)
 
 
@@ -59,7 +59,7 @@ class EffectInputs(NamedTuple):
     mass: Tensor  # [..., V, 1] kg
     memory: Tensor | None = None  # [..., N, K], the effect's own internal variables
     dt: float = 0.0  # s, since the internal variables were last evolved
-    lost: Tensor | None = None  # [..., V, 3] m, what was too small to be added to x in float32; the surface knows it
+    compensation: Tensor | None = None  # [..., V, 3] m, what was too small to be added to x in float32; the surface knows it
 
 
 class Trajectory(NamedTuple):

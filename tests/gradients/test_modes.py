@@ -8,7 +8,7 @@ import torch.autograd.forward_ad as forward_ad
 from helpers.gradient_scenes import parameters, simulate
 
 from torchcloth._utils.forward_mode import dense_tangents
-from torchcloth.testing.contract import batched, close, single
+from torchcloth.testing.contract import batch_parameters, require_close, unbatch_parameters
 
 
 @pytest.fixture(params=["swing", "pressed"])
@@ -66,8 +66,8 @@ def test_real_tangents_change_nothing(scene):
             with dense_tangents() if inside else nullcontext():
                 dual = evaluate(scene, duals, checkpoint=False)
             values.append(forward_ad.unpack_dual(dual))
-    close(values[1].primal, values[0].primal, 1e-13, "values")
-    close(values[1].tangent, values[0].tangent, 1e-11, "tangents")
+    require_close(values[1].primal, values[0].primal, 1e-13, "values")
+    require_close(values[1].tangent, values[0].tangent, 1e-11, "tangents")
 
 
 def test_checkpoints_change_nothing(scene):
@@ -79,7 +79,7 @@ def test_checkpoints_change_nothing(scene):
         gradients.append((out.detach(), torch.autograd.grad(out.pow(2).sum(), list(leaves.values()))))
     assert torch.equal(gradients[0][0], gradients[1][0])
     for name, a, b in zip(leaves_of(scene), gradients[0][1], gradients[1][1], strict=True):
-        close(a, b, 1e-12, name)
+        require_close(a, b, 1e-12, name)
 
 
 def test_checkpoints_within_long_intervals(swing):
@@ -92,7 +92,7 @@ def test_checkpoints_within_long_intervals(swing):
 def test_a_batch_equals_a_loop(scene):
     """States, poses and parameters at once, values and gradients."""
     names = parameters(scene.cloth)
-    many = batched(names, 3, spread=0.05)
+    many = batch_parameters(names, 3, spread=0.05)
     torch.manual_seed(0)
     fields = {name: value for name, value in leaves_of(scene).items() if name not in names}
     spread = {"x": 1e-3, "v": 0.1, "d3": 1e-2}
@@ -107,12 +107,12 @@ def test_a_batch_equals_a_loop(scene):
     together = evaluate(scene, leaves)
     gradients = dict(zip(leaves, torch.autograd.grad(together.pow(2).sum(), list(leaves.values())), strict=True))
     for k in range(3):
-        one = {**single(many, names, k), **{name: inputs[name][k] for name in fields}}
+        one = {**unbatch_parameters(many, names, k), **{name: inputs[name][k] for name in fields}}
         one = {name: value.clone().requires_grad_() for name, value in one.items()}
         alone = evaluate(scene, one)
-        close(together[k], alone, 1e-12, f"entry {k}")
+        require_close(together[k], alone, 1e-12, f"entry {k}")
         for name, gradient in zip(one, torch.autograd.grad(alone.pow(2).sum(), list(one.values())), strict=True):
-            close(gradients[name][k].reshape(gradient.shape), gradient, 1e-11, f"gradient of {name}, entry {k}")
+            require_close(gradients[name][k].reshape(gradient.shape), gradient, 1e-11, f"gradient of {name}, entry {k}")
 
 
 def test_float32_agrees_with_float64(scene):
@@ -124,7 +124,7 @@ def test_float32_agrees_with_float64(scene):
     out = evaluate(scene, leaves)
     assert out.dtype == torch.float32
     frames = 6 * len(scene.cloth.mesh.vertices) * (len(scene.times) - 1)
-    close(out[:frames].double(), exact[:frames], 1e-4, "positions and velocities")
+    require_close(out[:frames].double(), exact[:frames], 1e-4, "positions and velocities")
     for name, gradient in zip(leaves, torch.autograd.grad(out.pow(2).sum(), list(leaves.values())), strict=True):
         assert torch.isfinite(gradient).all(), name
 
@@ -144,9 +144,9 @@ def test_one_state_with_batched_poses_or_parameters(request, scene_name, what):
         entries = [{name: poses[k] for name, poses in many.items()} for k in range(3)]
     else:
         names = parameters(scene.cloth)
-        many = batched(names, 3, spread=0.05)
-        entries = [single(many, names, k) for k in range(3)]
+        many = batch_parameters(names, 3, spread=0.05)
+        entries = [unbatch_parameters(many, names, k) for k in range(3)]
     together = evaluate(scene, {**leaves, **many})
     for k, entry in enumerate(entries):
-        close(together[k], evaluate(scene, {**leaves, **entry}), 1e-12, f"entry {k}")
+        require_close(together[k], evaluate(scene, {**leaves, **entry}), 1e-12, f"entry {k}")
     assert not torch.allclose(together[0], together[1])

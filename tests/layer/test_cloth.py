@@ -170,7 +170,7 @@ def test_refuses_boundaries(boundary, message):
             "contact spacing; got 1e-07 m, for which",
         ),
         (lambda: tc.Contact(spacing=1e-300).resolve(tc.meshes.rectangle(1, 1)), "contact spacing; got 1e-300 m"),
-        (lambda: tc.Contact(spacing=5.0).grid(tc.meshes.rectangle(1, 1)), "contact spacing; got 5 m; expected at most"),
+        (lambda: tc.Contact(spacing=5.0).build_grid(tc.meshes.rectangle(1, 1)), "contact spacing; got 5 m; expected at most"),
         (
             lambda: tc.Contact(subdivisions=10**9).resolve(tc.meshes.rectangle(1, 1)),
             "contact subdivisions; got 1000000000",
@@ -302,12 +302,12 @@ def test_the_stable_step_is_stable(contact):
 
 def test_beyond_the_limit_a_membrane_blows_up():
     """The bound is no more than 1.6 times too careful on this mesh: 2 / omega x 1.6 diverges."""
-    from torchcloth.dynamics.stability import SAFETY
+    from torchcloth.dynamics.stability import STEP_SAFETY_FACTOR
 
     cloth = sheet()
-    state, dt = shaken(cloth), 1.6 * cloth.stable_step() / SAFETY
+    state, dt = shaken(cloth), 1.6 * cloth.stable_step() / STEP_SAFETY_FACTOR
     with torch.no_grad():
-        grown, _ = substep.rollout(cloth.model(), state, dt, {}, 100)
+        grown, _ = substep.rollout(cloth.build_model(), state, dt, {}, 100)
     moved = (grown.x - cloth.rest_state().x).abs().max()
     assert not bool(moved < 1e-3)  # ten thousand times the noise, or NaN
 

@@ -9,7 +9,7 @@ from helpers.small_sheet import sheet
 from torch.func import functional_call
 
 import torchcloth as tc
-from torchcloth.dynamics.model import kept
+from torchcloth.dynamics.model import shallow_clone_module
 from torchcloth.errors import InvalidInput
 
 
@@ -207,7 +207,7 @@ def test_no_scenes_are_no_state():
 def test_a_copy_that_a_simulation_works_with_owns_nothing():
     hand = tc.boundaries.Grasp.corner("upper-right", radius=1e-3)
     cloth = sheet(boundaries={"hand": hand})
-    kept(cloth)
+    shallow_clone_module(cloth)
     gc.collect()
     with pytest.raises(InvalidInput, match="an effect or boundary of another cloth"):
         sheet(7, boundaries={"hand": hand})

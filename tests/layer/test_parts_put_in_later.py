@@ -31,9 +31,9 @@ def test_a_copy_owns_its_parts(again):
 
 def test_places_are_part_of_a_mesh():
     here, there = (Mesh.build(MESH.vertices, MESH.faces, MESH.uv, places={"tip": [k]}) for k in (0, 5))
-    assert not here.same(there)
-    assert here.same(Mesh.build(MESH.vertices, MESH.faces, MESH.uv, places={"tip": [0]}))
-    assert not here.same(MESH)
+    assert not here.is_equal(there)
+    assert here.is_equal(Mesh.build(MESH.vertices, MESH.faces, MESH.uv, places={"tip": [0]}))
+    assert not here.is_equal(MESH)
     first = tc.Cloth(here, tc.materials.AEP(1e4), 0.2, {}, {"hand": tc.boundaries.Grasp.at("tip", 0.0)})
     with pytest.raises(InvalidInput, match="of another cloth"):
         tc.Cloth(there, tc.materials.AEP(1e4), 0.2, {}, dict(first.boundaries.items()))
@@ -77,7 +77,7 @@ def test_the_longest_piece_counts():
     both = torch.cat([torch.as_tensor(short.vertices), torch.as_tensor(folded) + torch.tensor([0.5, 0.0, 0.0])]).numpy()
     uv = torch.cat([torch.as_tensor(short.uv), torch.as_tensor(long.uv) + torch.tensor([0.5, 0.0])]).numpy()
     mesh = Mesh.build(both, faces, uv)
-    assert mesh.pieces == 2
+    assert mesh.piece_count == 2
     assert mesh.extent == pytest.approx(long.extent)
     assert mesh.extent > 0.99
 

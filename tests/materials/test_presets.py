@@ -30,12 +30,12 @@ def test_the_papers_rows_read_as_kilopascal(name):
     expected = [1e3 * E, nu, 1e3 * k, 1e3 * gamma]
     assert [float(v.value.detach()) for v in values] == pytest.approx(expected, rel=1e-12)
     assert material.thickness == 1e-3
-    assert "no unit" in presets.find(name).note
+    assert "no unit" in presets.find_fabric(name).note
 
 
 def test_every_row_has_a_source_and_a_grade():
-    assert len(presets.fabrics()) == 50
-    for name, fabric in presets.fabrics().items():
+    assert len(presets.load_fabrics()) == 50
+    for name, fabric in presets.load_fabrics().items():
         assert fabric.name == name
         assert len(fabric.source) > 20
         assert fabric.grade[0] in "ABC"
@@ -58,7 +58,7 @@ def test_si_units():
         "friction": (0.1, 0.6),
     }
     for key, (low, high) in ranges.items():
-        found = [getattr(f, key) for f in presets.fabrics().values() if getattr(f, key) is not None]
+        found = [getattr(f, key) for f in presets.load_fabrics().values() if getattr(f, key) is not None]
         assert found, key
         assert low < min(found) <= max(found) < high, key
 
@@ -96,14 +96,14 @@ def test_stiffness_does_not_depend_on_the_thickness_that_is_assumed():
 
 def test_published_poisson_ratio_becomes_the_symmetric_one():
     """F24's is along the warp: nu_12 = nu sqrt(E_warp / E_weft) must give it back."""
-    fabric = presets.find("F24-nylon")._replace(poisson=0.2)
+    fabric = presets.find_fabric("F24-nylon")._replace(poisson=0.2)
     arguments = fabric.orthotropic()
     back = arguments["poisson_ratio"] * (arguments["youngs_modulus"] / arguments["weft_modulus"]) ** 0.5
     assert back == pytest.approx(0.2)
 
 
 def test_published_poisson_ratio_stays_the_wefts_contraction_with_moduli_of_ones_own():
-    fabric = presets.find("cotton")
+    fabric = presets.find_fabric("cotton")
     given = fabric.orthotropic(shear_modulus=1e5, weft_modulus=fabric.membrane_warp / 1e-3 / 4)
     assert given["poisson_ratio"] * (given["youngs_modulus"] / given["weft_modulus"]) ** 0.5 == pytest.approx(0.15)
     assert fabric.orthotropic(shear_modulus=1e5, poisson_ratio=0.3)["poisson_ratio"] == 0.3
@@ -125,7 +125,7 @@ def test_a_number_is_no_plastic_set():
 def test_every_preset_gives_a_material_or_says_why_not():
     made, refusals = {AEP: 0, OrthotropicAEP: 0}, []
     given = {AEP: {}, OrthotropicAEP: {"shear_modulus": 5e4}}  # which no source states
-    for name in presets.fabrics():
+    for name in presets.load_fabrics():
         for law in made:
             try:
                 material = law.preset(name, **given[law])
@@ -141,20 +141,20 @@ def test_every_preset_gives_a_material_or_says_why_not():
 
 def test_bending_stiffness_is_at_hand():
     """A sheet of it bends: the published B reaches the effect."""
-    bending = tc.effects.Bending(presets.find("M15-B").bending_warp)
+    bending = tc.effects.Bending(presets.find_fabric("M15-B").bending_warp)
     mesh = tc.meshes.rectangle(0.1, 0.1, triangles=50)
     material = AEP.preset("M15-B", youngs_modulus=1e6)
-    cloth = tc.Cloth(mesh, material, presets.find("M15-B").areal_density, effects={"bending": bending}, contact=None)
+    cloth = tc.Cloth(mesh, material, presets.find_fabric("M15-B").areal_density, effects={"bending": bending}, contact=None)
     assert float(cloth.effects["bending"].stiffness.value.detach()) == pytest.approx(6.5705e-6)
 
 
 def test_unknown_names_are_refused_with_the_known_ones():
     with pytest.raises(InvalidInput, match=r"velvet.*cotton.*M15-A"):
-        presets.find("velvet")
+        presets.find_fabric("velvet")
 
 
 def test_table_is_readable():
-    lines = presets.table().splitlines()
+    lines = presets.format_table().splitlines()
     assert len(lines) == 51
     assert lines[0].startswith("name")
     row = next(line for line in lines if line.startswith("M15-A"))

@@ -225,7 +225,7 @@ def test_a_pattern_point_on_any_panel_is_found():
     laid = mesh.pattern[mesh.faces == corner]
     assert len(np.unique(laid, axis=0)) == 4  # body and sleeve, front and back
     for point in laid:
-        assert corner in mesh.nearest_vertices(point, 1e-6)
+        assert corner in mesh.vertices_near_pattern_points(point, 1e-6)
 
 
 def test_a_hung_dress_stays_sewn_and_hangs_its_length():

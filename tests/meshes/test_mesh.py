@@ -106,7 +106,7 @@ def test_without_a_pattern_the_placement_is_the_rest_shape():
     F = np.einsum("fai,faj->fij", corners, mesh.shape_gradient)
     np.testing.assert_allclose(np.einsum("fij,fik->fjk", F, F), np.broadcast_to(np.eye(2), (24, 2, 2)), atol=1e-12)
     with pytest.raises(InvalidInput, match="name the grasped vertices"):
-        mesh.nearest_vertices([[0.0, 0.0]], 0.1)
+        mesh.vertices_near_pattern_points([[0.0, 0.0]], 0.1)
 
 
 def test_a_pattern_seen_from_behind_is_turned_over():
@@ -133,12 +133,12 @@ def test_a_closed_tube_without_a_pattern():
 
 def test_nearest_vertices():
     mesh = tc.meshes.rectangle(0.4, 0.3, resolution=(5, 4))
-    np.testing.assert_array_equal(mesh.nearest_vertices([[0.0, 0.0]], 0.01), [0])
-    found = mesh.nearest_vertices([[0.0, 0.0], [0.4, 0.3]], 0.1)
+    np.testing.assert_array_equal(mesh.vertices_near_pattern_points([[0.0, 0.0]], 0.01), [0])
+    found = mesh.vertices_near_pattern_points([[0.0, 0.0], [0.4, 0.3]], 0.1)
     np.testing.assert_array_equal(found, [0, 1, 4, 15, 18, 19])
-    np.testing.assert_array_equal(mesh.nearest_vertices([0.2, 0.1], 0.02), [9])
+    np.testing.assert_array_equal(mesh.vertices_near_pattern_points([0.2, 0.1], 0.02), [9])
     with pytest.raises(InvalidInput, match=r"nearest: 0\.07071 m"):
-        mesh.nearest_vertices([[0.05, 0.05]], 0.02)
+        mesh.vertices_near_pattern_points([[0.05, 0.05]], 0.02)
 
 
 @pytest.mark.parametrize(
@@ -190,9 +190,9 @@ def test_where_the_pattern_parts_two_panels_are_sewn():
     assert mesh.uv is None
     assert len(mesh.boundary_edges) == 6
     np.testing.assert_array_equal(mesh.rest, laid)
-    np.testing.assert_array_equal(mesh.nearest_vertices([[7.0, 0.3]], 1e-9), [4])
-    np.testing.assert_array_equal(mesh.nearest_vertices([[6.0, 0.3]], 1e-9), [1])
-    np.testing.assert_array_equal(mesh.nearest_vertices([[1.0, 0.0]], 1e-9), [1])
+    np.testing.assert_array_equal(mesh.vertices_near_pattern_points([[7.0, 0.3]], 1e-9), [4])
+    np.testing.assert_array_equal(mesh.vertices_near_pattern_points([[6.0, 0.3]], 1e-9), [1])
+    np.testing.assert_array_equal(mesh.vertices_near_pattern_points([[1.0, 0.0]], 1e-9), [1])
 
 
 def test_corner_coordinates_that_agree_are_vertex_coordinates():
@@ -242,10 +242,10 @@ def test_places_are_vertices(index):
 
 def test_places_and_what_lies_around_them():
     mesh = Mesh.build(SQUARE, FACES, places={"tip": [2]})
-    assert mesh.around("tip").tolist() == [2]
-    assert mesh.around("tip", 1.0).tolist() == [1, 2, 3]
+    assert mesh.vertices_at_place("tip").tolist() == [2]
+    assert mesh.vertices_at_place("tip", 1.0).tolist() == [1, 2, 3]
     with pytest.raises(InvalidInput, match="place; got 'top'; expected one of tip"):
-        mesh.around("top")
+        mesh.vertices_at_place("top")
 
 
 def test_extent_is_the_cloth_s_whatever_its_placement():
@@ -359,7 +359,7 @@ def test_load_keeps_a_ply_with_coordinates_of_corners_sewn(tmp_path, binary, cor
     path.write_bytes("\n".join(head).encode() + body)
     loaded = tc.meshes.load(path)
     np.testing.assert_array_equal(loaded.vertices, x)
-    assert loaded.pieces == 1
+    assert loaded.piece_count == 1
     assert len(loaded.seams) == (len(mesh.seams) if corners == 3 else 1)
     np.testing.assert_allclose(loaded.area.sum(), mesh.area.sum() if corners == 3 else 2.0)
 
@@ -367,7 +367,7 @@ def test_load_keeps_a_ply_with_coordinates_of_corners_sewn(tmp_path, binary, cor
 def test_pieces_are_counted_and_told():
     one = tc.meshes.rectangle(0.2, 0.2, resolution=(3, 3))
     two = Mesh.build(np.concatenate([one.vertices, one.vertices + 0.1]), np.concatenate([one.faces, one.faces + 9]))
-    assert (one.pieces, two.pieces) == (1, 2)
+    assert (one.piece_count, two.piece_count) == (1, 2)
     assert "2 pieces that nothing joins" in repr(tc.Cloth(two, tc.materials.AEP(1e5), 0.2))
     assert "pieces" not in repr(tc.Cloth(one, tc.materials.AEP(1e5), 0.2))
 
@@ -434,8 +434,8 @@ def test_vertices_that_a_file_has_split_are_counted():
     other = one.vertices + np.array([0.1, 0.0, 0.0])
     vertices, faces = np.concatenate([one.vertices, other]), np.concatenate([one.faces, one.faces + len(one.vertices)])
     torn = tc.meshes.Mesh.build(vertices, faces, vertices[:, :2])
-    assert (one.torn, torn.torn) == (0, 6)
+    assert (one.duplicated_vertex_count, torn.duplicated_vertex_count) == (0, 6)
     with pytest.warns(UserWarning, match="6 vertices of the mesh lie on others of another piece"):
         tc.Cloth(torn, tc.materials.AEP(1e5), 0.2, contact=None)
     apart = tc.meshes.Mesh.build(vertices + 1e-3 * (np.arange(len(vertices)) > 8)[:, None], faces, vertices[:, :2])
-    assert apart.torn == 0
+    assert apart.duplicated_vertex_count == 0

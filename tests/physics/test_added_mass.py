@@ -6,9 +6,9 @@ import pytest
 import torch
 
 import torchcloth as tc
-from torchcloth._utils.linalg import loaded
+from torchcloth._utils.linalg import apply_added_mass
 from torchcloth.dynamics import substep
-from torchcloth.dynamics.forces import resistance_of
+from torchcloth.dynamics.forces import compute_added_mass_ratio
 
 DENSITY = 0.18
 DEPTH = 0.1  # m of air
@@ -50,11 +50,11 @@ def test_what_the_cloth_gains_the_air_loses_along_its_normals():
     torch.manual_seed(0)
     x, v = cloth.rest_state().x + 0.02 * torch.randn(16, 3), torch.randn(16, 3)
     dt, faces = cloth.stable_step(), torch.as_tensor(cloth.mesh.faces)
-    after, _ = substep.step(cloth.model(), cloth.state(x, v), dt, {}, 0)
+    after, _ = substep.step(cloth.build_model(), cloth.state(x, v), dt, {}, 0)
     n, turn = torch.func.jvp(lambda x: normals(cloth, x), (x,), (v,))
     change = (n * (after.v - v)[faces] + dt * turn * v[faces]).sum(-1, keepdim=True)
     impulse = (EXTRA / 3 * torch.as_tensor(cloth.mesh.area)[:, None, None] * change * n).sum((0, 1))
-    own = (cloth.model().mass * (after.v - v)).sum(0)
+    own = (cloth.build_model().mass * (after.v - v)).sum(0)
     assert own.norm() > 1e3 * (own + impulse).norm()
     assert (own + impulse).norm() < 1e-12
 
@@ -132,7 +132,7 @@ def test_the_static_shape_stays():
 def test_a_spinning_sheet_is_not_braked(axis):
     cloth = sheet(air())
     omega = 6.0 * torch.tensor(axis)
-    x, mass = cloth.rest_state().x, cloth.model().mass
+    x, mass = cloth.rest_state().x, cloth.build_model().mass
     centre = (mass * x).sum(0) / mass.sum()
     state = cloth.state(x, torch.linalg.cross(omega.expand_as(x), x - centre))
     out = cloth(state, times=[0.0, 0.25]).state
@@ -197,15 +197,15 @@ def test_what_stops_cloth_and_air_pushes_along_the_normal(turn):
     aslant = torch.stack([x[:, 0], 0.8 * x[:, 1], 0.6 * x[:, 1]], -1)
     speed = torch.tensor([0.1, 0.2, -0.5]).expand(16, 3)
     still = {"floor": tc.Trajectory(torch.tensor([0.0, 1.0]), torch.eye(4).repeat(2, 1, 1), torch.ones(2, dtype=bool))}
-    model, state = cloth.model(), cloth.state(aslant, speed)
-    drives = {name: tc.boundaries.drive(t, torch.tensor([0.0, 1e-4])) for name, t in still.items()}
+    model, state = cloth.build_model(), cloth.state(aslant, speed)
+    drives = {name: tc.boundaries.sample_trajectory(t, torch.tensor([0.0, 1e-4])) for name, t in still.items()}
     after, impulses = substep.step(model, state, 1e-4, drives, 0)
     assert float(after.v[aslant[:, 2] < 1e-9, 2].abs().max()) < 1e-12
     given = impulses["floor"][:3]
     assert float(given[2]) > 1e-3
     assert float(given[:2].abs().max()) < 1e-12 * float(given[2])
-    inertia = resistance_of(model, substep.surface(model.geometry, aslant, speed), aslant)
-    energy = [0.5 * float((model.mass * v * loaded(inertia, v)).sum()) for v in (speed, after.v)]
+    inertia = compute_added_mass_ratio(model, substep.surface(model.geometry, aslant, speed), aslant)
+    energy = [0.5 * float((model.mass * v * apply_added_mass(inertia, v)).sum()) for v in (speed, after.v)]
     assert energy[1] < energy[0]
 
 

@@ -6,7 +6,7 @@ import torch
 import torchcloth as tc
 from torchcloth.effects import Adhesion, BodyForce, Gravity
 from torchcloth.errors import InvalidInput
-from torchcloth.types import Moment
+from torchcloth.types import EffectInputs
 
 DENSITY, STRESS, GAP, MU, G = 0.2, 1.5, 1e-3, 0.4, 9.81  # kg/m^2, Pa, m, -, m/s^2
 
@@ -56,7 +56,7 @@ def test_lifting_costs_what_it_says():
     heights = torch.linspace(0.0, 2 * GAP, 2001)
     x = torch.as_tensor(mesh.vertices).to(heights) * torch.tensor([1.0, 1.0, 0.0])
     x = x + heights[:, None, None] * torch.tensor([0.0, 0.0, 1.0])
-    force = effect.force(effect.coefficients(), Moment(x, torch.zeros_like(x), None, None))  # type: ignore[arg-type]
+    force = effect.force(effect.coefficients(), EffectInputs(x, torch.zeros_like(x), None, None))  # type: ignore[arg-type]
     work = -float(torch.trapezoid(force[..., 2].sum(-1), heights))
     assert work == pytest.approx(8 / 15 * STRESS * GAP * 0.2 * 0.15, rel=1e-5)
     assert not force[heights >= GAP].any()

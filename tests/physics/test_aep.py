@@ -38,11 +38,11 @@ def test_forces_are_minus_the_gradient_of_the_energy(convention, seed):
     state = deformed(cloth, seed=seed)
     x, d3 = state.x.clone().requires_grad_(), state.d3.clone().requires_grad_()
     by_x, by_d3 = torch.autograd.grad(potential(cloth, state._replace(x=x, d3=d3)), (x, d3))
-    model = cloth.model()
+    model = cloth.build_model()
     s = substep.surface(model.geometry, state.x, state.v)
-    layers = self_contact.near_layers(model, model.grid, state.x)
-    director = self_contact.pressure(model, model.grid, layers, state, s, 1e-4)
-    columns = self_contact.add_columns(layers, elasticity.membrane_stress(model, s, {}), director)
+    layers = self_contact.find_contact_candidates(model, model.grid, state.x)
+    director = self_contact.compute_director_forces(model, model.grid, layers, state, s, 1e-4)
+    columns = self_contact.add_director_stress(layers, elasticity.membrane_stress(model, s, {}), director)
     force = forces.vertex_forces(model, state, s, {}, columns)
     torch.testing.assert_close(force, -by_x, rtol=1e-10, atol=1e-10 * by_x.abs().max())
     torch.testing.assert_close(director.pull, by_d3, rtol=1e-10, atol=1e-10 * by_d3.abs().max())
@@ -51,7 +51,7 @@ def test_forces_are_minus_the_gradient_of_the_energy(convention, seed):
 def test_energy_equals_the_singular_value_form_of_the_paper():
     cloth = random_cloth("paper")
     state = deformed(cloth)
-    model = cloth.model()
+    model = cloth.build_model()
     s = substep.surface(model.geometry, state.x, state.v)
     F = torch.stack([s.f1, s.f2], dim=-1)
     sigma = torch.linalg.svdvals(F)
@@ -72,7 +72,7 @@ def test_energy_equals_the_singular_value_form_of_the_paper():
 
 def test_rest_is_stress_free():
     cloth = random_cloth()
-    model = cloth.model()
+    model = cloth.build_model()
     state = cloth.rest_state()
     s = substep.surface(model.geometry, state.x, state.v)
     for column in model.material.membrane_stress(model.coefficients, s):

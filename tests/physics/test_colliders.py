@@ -106,7 +106,7 @@ def test_a_sphere_pushed_into_a_hanging_sheet_feels_what_it_gives():
     times = torch.linspace(0, 0.2, 11)
     with torch.no_grad():
         out = cloth(cloth.rest_state(), motion, times)
-        mass = cloth.model().mass
+        mass = cloth.build_model().mass
     gained = (mass * out.v).sum(-2)
     forces = out.wrench["top"][1:, :3] + out.wrench["ball"][1:, :3]
     weight = mass.sum() * torch.tensor([0.0, -G, 0.0])
@@ -127,7 +127,7 @@ def test_a_turning_sphere_carries_a_cap_of_cloth():
     times = torch.linspace(0, 0.5, 26)
     with torch.no_grad():
         out = cloth(cloth.state(x), motion, times)
-        mass = cloth.model().mass
+        mass = cloth.build_model().mass
     spin = (mass * torch.linalg.cross(out.x, out.v)).sum(-2)[:, 2]
     inertia = (mass * (out.x[..., :2] ** 2).sum(-1, keepdim=True)).sum((-2, -1))
     assert float((spin / inertia)[-5:].mean()) == pytest.approx(rate, rel=0.02)
@@ -182,7 +182,7 @@ def test_what_starts_inside_adds_little_energy(sampling):
         empty = out.state.d3
         states = [tc.ClothState(x, v, empty) for x, v in zip(out.x, out.v, strict=True)]
         energies = torch.stack([sum(cloth.energy(state).values()) for state in states])
-        mass = cloth.model().mass.sum()
+        mass = cloth.build_model().mass.sum()
         depths = ball.clearance(out.x)[0].amin((-2, -1))
     assert float(depths[0]) == pytest.approx(-0.03, abs=2e-3)
     assert float(depths[-1]) > -1e-9

@@ -8,9 +8,8 @@ import pytest
 import torch
 
 import torchcloth as tc
-from torchcloth.dynamics import substep
-from torchcloth.dynamics.contact import FADING, GAP, TOUCH, self_contact
-from torchcloth.dynamics.contact.neighbours import over
+from torchcloth.dynamics.contact import APPROACH_PER_COMPRESSION_SPACINGS, REST_GAP_SPACINGS, COMPRESSION_ONSET_SPACINGS, self_contact
+from torchcloth.dynamics.contact.neighbours import find_overlapping_triangles
 
 SPACING, STIFFNESS, DENSITY = 0.01, 100.0, 0.15  # m, k h [N/m], kg/m^2
 
@@ -59,7 +58,7 @@ def test_a_sheet_alone_needs_no_grid():
         x[:, 2] = 0.03 * torch.sin(20 * x[:, 0])
         runs.append(cloth(cloth.state(x), times=[0.0, 0.02], dt=1e-4))
     assert torch.equal(runs[0].x, runs[1].x)
-    assert len(self_contact.near_layers(cloth.model(), cloth.model().grid, runs[1].x[-1]).active) == 0
+    assert len(self_contact.find_contact_candidates(cloth.build_model(), cloth.build_model().grid, runs[1].x[-1]).active) == 0
 
 
 @torch.no_grad()
@@ -67,7 +66,7 @@ def test_only_triangles_near_another_layer_take_part():
     """Folded in half: all but those at the sharp crease; half unrolled: about half of them."""
     mesh = tc.meshes.rectangle(0.4, 0.1, resolution=(41, 11))
     cloth = tc.Cloth(mesh, tc.materials.AEP(1e5), DENSITY, contact=tc.Contact(spacing=0.01))
-    model, flat = cloth.model(), torch.as_tensor(mesh.vertices)
+    model, flat = cloth.build_model(), torch.as_tensor(mesh.vertices)
 
     def folded(at):
         x = flat.clone()
@@ -76,7 +75,7 @@ def test_only_triangles_near_another_layer_take_part():
         x[over, 2] = 0.014
         return x
 
-    share = [len(self_contact.near_layers(model, model.grid, folded(at)).active) / len(mesh.faces) for at in (0.2, 0.3)]
+    share = [len(self_contact.find_contact_candidates(model, model.grid, folded(at)).active) / len(mesh.faces) for at in (0.2, 0.3)]
     assert 0.9 < share[0] < 1.0
     assert 0.45 < share[1] < 0.75
 
@@ -86,14 +85,14 @@ def test_layers_are_found_as_well_far_from_the_origin():
     """Float32 at 60 m has 4 micrometres between numbers; squares of 60 m have none for a gap of millimetres."""
     mesh = tc.meshes.rectangle(0.4, 0.1, resolution=(41, 11))
     cloth = tc.Cloth(mesh, tc.materials.AEP(1e5), DENSITY, contact=tc.Contact(spacing=0.005)).float()
-    x, model = torch.as_tensor(mesh.vertices).float(), cloth.model()
+    x, model = torch.as_tensor(mesh.vertices).float(), cloth.build_model()
     x[x[:, 0] > 0.2, 0] = 0.4 - x[x[:, 0] > 0.2, 0]
     x[torch.arange(len(x)) % 41 > 20, 2] = 0.006
     found = []
     for away in (0.0, 60.0):
         there = x + torch.tensor([away, -away, 0.5 * away]).float()
-        layers = self_contact.near_layers(model, model.grid, there)
-        found.append((len(layers.active), self_contact.first_directors(model, model.grid, there)))
+        layers = self_contact.find_contact_candidates(model, model.grid, there)
+        found.append((len(layers.active), self_contact.initial_directors(model, model.grid, there)))
     assert found[0][0] == pytest.approx(found[1][0], abs=4)
     assert found[0][0] > 300
     torch.testing.assert_close(found[0][1], found[1][1], rtol=0, atol=0.01)
@@ -114,7 +113,7 @@ def test_layers_come_to_rest_at_the_stated_gap(speed, stiffness):
     out = cloth(cloth.state(cloth.rest_state().x, v), still(), times=torch.linspace(0, 0.3, 7))
     height = out.x[:, upper, 2] / SPACING
     assert float(height.min()) > 0.5
-    assert float(height[-1].mean()) == pytest.approx(GAP, rel=0.15)
+    assert float(height[-1].mean()) == pytest.approx(REST_GAP_SPACINGS, rel=0.15)
     assert float((height[-1] - height[-2]).mean().abs()) < 0.02
 
 
@@ -124,14 +123,14 @@ def test_where_approaching_layers_begin_to_press():
     """TOUCH and FADING: the gap at rest without play, and how it falls with play."""
     gaps = []
     for play in (0.0, 0.2):
-        contact = tc.Contact(spacing=SPACING, play=play)
+        contact = tc.Contact(spacing=SPACING, free_compression=play)
         cloth, upper = layers(
             2.6 * SPACING, contact=contact, effects={**gravity(), "drag": tc.effects.MassDamping(20.0)}
         )
         out = cloth(cloth.rest_state(), still(), times=[0.0, 0.4])
         gaps.append(float(out.x[-1, upper, 2].mean()) / SPACING)
-    assert gaps[0] == pytest.approx(TOUCH, rel=0.05)
-    assert (gaps[0] - gaps[1]) / 0.2 == pytest.approx(FADING, rel=0.15)
+    assert gaps[0] == pytest.approx(COMPRESSION_ONSET_SPACINGS, rel=0.05)
+    assert (gaps[0] - gaps[1]) / 0.2 == pytest.approx(APPROACH_PER_COMPRESSION_SPACINGS, rel=0.15)
 
 
 @torch.no_grad()
@@ -165,7 +164,7 @@ def test_momentum_passes_between_layers_without_loss():
     v = torch.zeros(len(cloth.mesh.vertices), 3)
     v[upper] = torch.tensor([0.2, 0.1, -1.0])
     state = cloth.state(cloth.rest_state().x, v)
-    mass = cloth.model().mass
+    mass = cloth.build_model().mass
     out = cloth(state, times=[0.0, 0.03])
     before, after = (mass * state.v).sum(0), (mass * out.v[-1]).sum(0)
     torch.testing.assert_close(after, before, rtol=0, atol=1e-12 * float(mass.sum()))
@@ -211,19 +210,19 @@ def test_the_search_is_repeated_in_time():
     cloth, upper = layers(0.12, contact=tc.Contact(spacing=0.005), stiffness=50.0)
     v = torch.zeros(len(cloth.mesh.vertices), 3)
     v[upper, 2] = -2.0
-    model, state = cloth.model(), cloth.state(cloth.rest_state().x, v)
-    assert len(self_contact.near_layers(model, model.grid, state.x).active) == 0
+    model, state = cloth.build_model(), cloth.state(cloth.rest_state().x, v)
+    assert len(self_contact.find_contact_candidates(model, model.grid, state.x).active) == 0
     out = cloth(state, still(), times=[0.0, 0.08])
     assert float(out.x[-1, upper, 2].min()) > 0.0
 
 
 def test_wrong_contact_is_refused():
-    for wrong in ({"damping": -1.0}, {"play": 0.9}):
+    for wrong in ({"damping": -1.0}, {"free_compression": 0.9}):
         with pytest.raises(tc.errors.InvalidInput):
             tc.Contact(**wrong)
     with pytest.raises(tc.errors.InvalidInput):
         layers(0.02, contact=tc.Contact(spacing=0.002, subdivisions=1))
-    assert tc.Contact.with_gap(0.005).spacing == pytest.approx(0.005 / GAP)
+    assert tc.Contact.with_gap(0.005).spacing == pytest.approx(0.005 / REST_GAP_SPACINGS)
 
 
 @pytest.mark.parametrize("cell", [0.03, 0.06])
@@ -274,11 +273,11 @@ def test_contact_that_costs_a_hundred_times_as_much_is_told():
 def test_what_lies_over_what():
     """Two sheets 1 cm apart, each of whose triangles has some of the other over it; none of its own."""
     cloth, _ = layers(0.01)
-    found = over(cloth.mesh, 0.02)
+    found = find_overlapping_triangles(cloth.mesh, 0.02)
     assert len(found)
     assert ((found[:, 0] < 32) != (found[:, 1] < 32)).all()
-    assert not len(over(cloth.mesh, 0.005))
+    assert not len(find_overlapping_triangles(cloth.mesh, 0.005))
     bent = tc.meshes.rectangle(0.3, 0.3, resolution=(20, 20))
     vertices = bent.vertices.copy()
     vertices[:, 2] = 0.05 * np.sin(20 * vertices[:, 0])
-    assert not len(over(tc.meshes.Mesh.build(vertices, bent.faces, bent.uv), 0.03))
+    assert not len(find_overlapping_triangles(tc.meshes.Mesh.build(vertices, bent.faces, bent.uv), 0.03))

@@ -25,7 +25,7 @@ def test_crease_of_a_sheet_held_bent(steps, degrees):
     x = cylinder(mesh, 12.0, degrees)
     time = 0.04
     crease = through(effect, mesh, [torch.as_tensor(mesh.vertices), *[x] * steps], dt=time / steps)[-1]
-    seen = effect.sheet.see(x).curvature
+    seen = effect.stencil.fit_surface(x).curvature
     size = seen.norm(dim=-1, keepdim=True)
     expected = (size - YIELD) * (1 - math.exp(-MOBILITY * time)) * seen / size
     torch.testing.assert_close(crease, expected, rtol=1e-9, atol=1e-12)

@@ -146,7 +146,7 @@ def test_a_strip_keeps_part_of_its_bend():
     for _ in range(60):
         middle = (low + high) / 2
         low, high = (low, middle) if left(middle) > 0 else (middle, high)
-    seen = cloth.effects["friction"].sheet.see(out.x[-1]).curvature[:, 0].median().item()
+    seen = cloth.effects["friction"].stencil.fit_surface(out.x[-1]).curvature[:, 0].median().item()
     assert c.item() == friction
     assert seen == pytest.approx(low, rel=0.02)
     assert 2.0 < low < 6.0
@@ -166,7 +166,7 @@ def test_gradients_through_a_reversal():
     times = (0.0, 12 * cloth.stable_step())
     with torch.no_grad():
         out = cloth(state, times=torch.linspace(*times, 13)).x
-    bent = cloth.effects["friction"].sheet.see(out).curvature.diff(dim=0)
+    bent = cloth.effects["friction"].stencil.fit_surface(out).curvature.diff(dim=0)
     assert (bent[1:] * bent[:-1] < 0).any(0).float().mean() > 0.8, "most curvatures turn round"
     names = ("friction.moment", "shear.hysteresis", "bending.stiffness")
     check_gradients(*relative(cloth, state, times, names), 1e-6, acts=True)

@@ -59,7 +59,7 @@ def test_the_pull_never_exceeds_what_a_slippery_grip_can_hold():
     pull = out.wrench["hand"][1:, :3].norm(dim=-1)
     assert float(pull.max()) <= hold * (1 + 1e-6)
     assert float(pull[-1]) == pytest.approx(hold, rel=1e-6)
-    momentum = (cloth.model().mass * out.v[-1]).sum(0)[1]  # what the weight gave, less what the wrench says
+    momentum = (cloth.build_model().mass * out.v[-1]).sum(0)[1]  # what the weight gave, less what the wrench says
     assert float(momentum) == pytest.approx(-0.1 * WEIGHT - 0.01 * float(out.wrench["hand"][1:, 1].sum()), rel=1e-9)
 
 
@@ -98,8 +98,8 @@ def test_gradients_at_no_pull_are_finite():
     effect = cloth.effects["slip"]
     with torch.enable_grad():
         v = torch.zeros(24, 3, requires_grad=True)
-        index, mass = cloth.boundaries["hand"].index, cloth.model().mass.detach()
-        out = effect.loosen(effect.coefficients(), index, v, 0 * v, mass, 1e-4, None)
+        index, mass = cloth.boundaries["hand"].index, cloth.build_model().mass.detach()
+        out = effect.grip_velocities(effect.coefficients(), index, v, 0 * v, mass, 1e-4, None)
         gradients = torch.autograd.grad(out.sum(), [v, *effect.parameters()])
     assert all(torch.isfinite(g).all() for g in gradients)
 

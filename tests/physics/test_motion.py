@@ -6,7 +6,7 @@ import pytest
 import torch
 
 import torchcloth as tc
-from torchcloth.boundaries.motion import drive, interpolate
+from torchcloth.boundaries.motion import interpolate_poses, sample_trajectory
 
 
 def sheet(size=0.3, n=8, *, effects=None, boundaries=None, contact=tc.Contact(), Y=300.0, density=0.15):  # noqa: B008
@@ -16,7 +16,7 @@ def sheet(size=0.3, n=8, *, effects=None, boundaries=None, contact=tc.Contact(),
 
 
 def momenta(cloth, state):
-    mass = cloth.model().mass
+    mass = cloth.build_model().mass
     linear = (mass * state.v).sum(-2)
     angular = torch.linalg.cross(state.x, mass * state.v).sum(-2)
     return linear, angular
@@ -55,7 +55,7 @@ def test_a_spinning_sheet_is_not_braked_by_its_director(axis):
     cloth = sheet(n=6, contact=tc.Contact(everywhere=True))
     omega = 6.0 * torch.tensor(axis)
     x = cloth.rest_state().x
-    centre = (cloth.model().mass * x).sum(0) / cloth.model().mass.sum()
+    centre = (cloth.build_model().mass * x).sum(0) / cloth.build_model().mass.sum()
     state = cloth.state(x, torch.linalg.cross(omega.expand_as(x), x - centre))
     before = cloth.energy(state)["kinetic"], momenta(cloth, state)[1]
     out = cloth(state, times=[0.0, 0.25]).state
@@ -149,7 +149,7 @@ def test_float32_has_room_for_substeps_whatever_the_clock_says(origin):
 
 def test_a_path_of_one_knot_stands_still():
     still = tc.Trajectory(torch.zeros(1), torch.eye(4)[None], torch.ones(1, dtype=torch.bool))
-    torch.testing.assert_close(interpolate(still, torch.tensor([-1.0, 0.0, 2.0])), torch.eye(4).expand(3, 4, 4))
+    torch.testing.assert_close(interpolate_poses(still, torch.tensor([-1.0, 0.0, 2.0])), torch.eye(4).expand(3, 4, 4))
 
 
 def test_a_hand_that_closes_at_a_knot_of_single_precision_is_closed_there():
@@ -158,4 +158,4 @@ def test_a_hand_that_closes_at_a_knot_of_single_precision_is_closed_there():
     motion = tc.Trajectory(t, torch.eye(4).repeat(11, 1, 1), torch.arange(11) >= 3)
     for start, closed in ((0.3, True), (0.2999, False), (0.0, False)):
         times = torch.tensor([start, start + 1e-3], dtype=torch.float64)
-        assert drive(motion, times).closed == (closed,), start
+        assert sample_trajectory(motion, times).closed == (closed,), start

@@ -6,9 +6,9 @@ import torch
 import torchcloth as tc
 from torchcloth.dynamics import substep
 from torchcloth.effects import AirDrag, Bending, KelvinVoigt, MassDamping, ResidualForce
-from torchcloth.effects.residual import LAWS, PLACES, describe
+from torchcloth.effects.residual import RESIDUAL_LAWS, RESIDUAL_PLACES, describe_term
 from torchcloth.errors import InvalidInput
-from torchcloth.types import Moment
+from torchcloth.types import EffectInputs
 
 DENSITY = 0.2  # kg/m^2
 
@@ -26,9 +26,9 @@ def cloth_with(effect, n=5):
 
 def force(cloth, x, v):
     """[V, 3] N."""
-    model = cloth.model()
+    model = cloth.build_model()
     effect, c = model.effects["it"]
-    found = effect.force(c, Moment(x, v, substep.surface(model.geometry, x, v), model.mass))
+    found = effect.force(c, EffectInputs(x, v, substep.surface(model.geometry, x, v), model.mass))
     if effect.acts_on == "vertices":
         return found
     corners = torch.as_tensor(cloth.mesh.faces)
@@ -78,10 +78,10 @@ def test_across_and_along_make_up_linear_drag():
 def test_mass_is_added_and_weighs():
     heavier = cloth_with(ResidualForce({"mass": 0.1}))
     bare = cloth_with(ResidualForce({"across": 0.0}))
-    assert torch.allclose(heavier.model().mass, 1.5 * bare.model().mass)
+    assert torch.allclose(heavier.build_model().mass, 1.5 * bare.build_model().mass)
 
 
-@pytest.mark.parametrize("place", [p for p in PLACES if p])
+@pytest.mark.parametrize("place", [p for p in RESIDUAL_PLACES if p])
 def test_places_do_not_know_the_mesh(place):
     totals = []
     for n in (13, 25):
@@ -89,23 +89,23 @@ def test_places_do_not_know_the_mesh(place):
         corner = [int(((mesh.uv - [0.0, 0.2]) ** 2).sum(1).argmin())]
         effect = ResidualForce({f"mass@{place}": 0.1}, corner)
         cloth = tc.Cloth(mesh, tc.materials.AEP(1e5, 0.3), DENSITY, {"it": effect}, contact=None)
-        totals.append(float(cloth.model().mass.sum()) - DENSITY * 0.06)
+        totals.append(float(cloth.build_model().mass.sum()) - DENSITY * 0.06)
     assert totals[0] > 1e-4
     assert totals[0] == pytest.approx(totals[1], rel=0.03)
 
 
-@pytest.mark.parametrize("law", [law for law in LAWS if law not in ("mass", "bend")])
+@pytest.mark.parametrize("law", [law for law in RESIDUAL_LAWS if law not in ("mass", "bend")])
 def test_what_opposes_takes_power(law):
     cloth = cloth_with(ResidualForce({law: 1.0}))
     x, v = moving(cloth)
     assert float((force(cloth, x, v) * v).sum()) < 0
 
 
-@pytest.mark.parametrize("law", [law for law in LAWS if law != "mass"])
-@pytest.mark.parametrize("place", PLACES)
+@pytest.mark.parametrize("law", [law for law in RESIDUAL_LAWS if law != "mass"])
+@pytest.mark.parametrize("place", RESIDUAL_PLACES)
 def test_it_turns_with_the_cloth(law, place):
     """In a room without a direction of its own: still air, no gravity."""
-    cloth = cloth_with(ResidualForce({f"{law}@{place}".rstrip("@"): 1.0}, held=[0]))
+    cloth = cloth_with(ResidualForce({f"{law}@{place}".rstrip("@"): 1.0}, gripped_vertices=[0]))
     x, v = moving(cloth)
     x = x + 0.01 * torch.randn(x.shape)  # bent and strained
     turn = torch.linalg.qr(torch.randn(3, 3)).Q
@@ -143,15 +143,15 @@ def test_what_opposes_bending_leaves_flat_cloth_alone():
 
 def test_it_says_what_it_does_and_refuses_what_it_does_not_know():
     assert (
-        describe("across2@edge", 0.4)
+        describe_term("across2@edge", 0.4)
         == "opposes motion across the cloth, growing as speed squared, near the free edges"
     )
-    assert describe("mass", -0.1).startswith("the opposite of")
+    assert describe_term("mass", -0.1).startswith("the opposite of")
     for terms in ({}, {"magnetism": 1.0}, {"across@hem": 1.0}):
         with pytest.raises(InvalidInput, match="terms"):
             ResidualForce(terms)
     with pytest.raises(InvalidInput, match="held; got vertex 36; expected 0 to 35"):
-        ResidualForce({"across": 1.0}, held=[0, 36]).bind(tc.meshes.rectangle(0.2, 0.2, resolution=(6, 6)))
+        ResidualForce({"across": 1.0}, gripped_vertices=[0, 36]).bind(tc.meshes.rectangle(0.2, 0.2, resolution=(6, 6)))
 
 
 def test_mass_that_is_taken_away_shortens_the_step():

@@ -88,7 +88,7 @@ def test_a_turned_sheet_gives_turned_results():
 
 def test_force_is_minus_the_gradient_of_the_energy():
     cloth = sheet(pattern(20.0), S1, S2, SKEW)
-    model = cloth.model()
+    model = cloth.build_model()
     torch.manual_seed(0)
     x = (cloth.rest_state().x + 0.01 * torch.randn(30, 3)).detach().requires_grad_()
 

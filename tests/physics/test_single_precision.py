@@ -6,7 +6,7 @@ import pytest
 import torch
 
 import torchcloth as tc
-from torchcloth.dynamics.contact.transfer import push, stencil
+from torchcloth.dynamics.contact.transfer import transfer_director_forces, place_on_grid
 from torchcloth.effects import AbstractEffect
 
 SPEED = 1e-3  # m/s: some two units a substep at half a metre from the origin
@@ -151,11 +151,11 @@ def test_inner_friction_does_not_wear_off_as_cloth_is_turned(engine, seconds):
 @pytest.mark.parametrize("corner", [1.5 - 1e-7, 0.5 + 1e-7])
 def test_a_node_that_hardly_weighs_has_finite_derivatives(corner):
     """One over the square of its mass is more than float32 holds: gradients of contact were NaN."""
-    grid = tc.Contact(spacing=0.01).grid(tc.meshes.rectangle(0.1, 0.1, resolution=(5, 5)))
+    grid = tc.Contact(spacing=0.01).build_grid(tc.meshes.rectangle(0.1, 0.1, resolution=(5, 5)))
     place = (0.01 * torch.full((1, 3), corner)).requires_grad_()
     mass = torch.tensor([[1e-6]], requires_grad=True)
-    nodes = stencil(place, mass, torch.zeros(1, dtype=torch.int64), grid, torch.zeros(grid.nodes**3, dtype=torch.int32))
-    change, moment = push(nodes, torch.ones(1, 3), torch.ones(1, 3), grid.spacing, 1e-4)
+    nodes = place_on_grid(place, mass, torch.zeros(1, dtype=torch.int64), grid, torch.zeros(grid.nodes**3, dtype=torch.int32))
+    change, moment = transfer_director_forces(nodes, torch.ones(1, 3), torch.ones(1, 3), grid.spacing, 1e-4)
     (change.sum() + moment.sum()).backward()
     assert torch.isfinite(place.grad).all()
     assert torch.isfinite(mass.grad).all()

@@ -98,7 +98,7 @@ def growth(material, strain, dt):
     noise = 1e-5 * samples.normal(tuple(x.shape), 0) * torch.tensor([1.0, 1.0, 0.0])
     state, totals = cloth.state(x * (1 + strain) + noise), []
     with torch.no_grad():
-        model = cloth.model()
+        model = cloth.build_model()
         for _ in range(60):
             totals.append(sum(cloth.energy(state).values()))
             state, _ = substep.rollout(model, state, dt, {}, 20)
@@ -124,7 +124,7 @@ def test_step_bounds_the_frequency_of_a_stretched_sheet(strain, across):
     strip = Strip(0.1, 0.03, 0, woven(50.0, 20.0, nu=0.3), resolution=(8, 4))
     x = strip.rest * torch.tensor([1 + strain, 1 + across * strain])
     hessian = strip.hessian(x)
-    mass = strip.cloth.model().mass.detach().repeat_interleave(2)
+    mass = strip.cloth.build_model().mass.detach().repeat_interleave(2)
     omega = torch.linalg.eigvalsh(hessian / (mass[:, None] * mass).sqrt()).max().sqrt()
     assert strip.cloth.stable_step() * float(omega) / 2 < 0.9
 

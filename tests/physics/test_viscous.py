@@ -7,7 +7,7 @@ import torch
 
 import torchcloth as tc
 from torchcloth.dynamics import substep
-from torchcloth.types import Moment
+from torchcloth.types import EffectInputs
 
 ETA = 0.7
 
@@ -24,9 +24,9 @@ def sheet(eta=ETA, Y=100.0, n=5):
 
 
 def force(cloth, x, v):
-    model = cloth.model()
+    model = cloth.build_model()
     effect, c = model.effects["viscous"]
-    return effect.force(c, Moment(x, v, substep.surface(model.geometry, x, v), model.mass))
+    return effect.force(c, EffectInputs(x, v, substep.surface(model.geometry, x, v), model.mass))
 
 
 def bent(cloth, batch=()):
@@ -56,7 +56,7 @@ def test_power_is_that_of_the_strain_rate():
     cloth = sheet()
     x = bent(cloth, (8,))
     v = torch.randn_like(x)
-    geometry = cloth.model().geometry
+    geometry = cloth.build_model().geometry
 
     def strain(moved):
         s = substep.surface(geometry, moved, v)
@@ -75,7 +75,7 @@ def test_a_spinning_sheet_keeps_spinning():
     kinetic = []
     for eta in (0.0, ETA):
         cloth = sheet(eta)
-        x, mass = cloth.rest_state().x, cloth.model().mass
+        x, mass = cloth.rest_state().x, cloth.build_model().mass
         centre = (mass * x).sum(0) / mass.sum()
         omega = torch.tensor([3.6, 0.0, 4.8])
         state = cloth.state(x, torch.linalg.cross(omega.expand_as(x), x - centre))
@@ -113,7 +113,7 @@ def test_axial_vibration_of_a_strip_decays(share):
     start = torch.cat([x[:, :1] + size * torch.sin(k * x[:, :1]), x[:, 1:]], dim=-1)
     t = torch.linspace(0.0, 2.0 / decay, 41)
     dt = share * cloth.stable_step()
-    assert (cloth.plan(cloth.rest_state(), {"clamp": still}, t, dt).model.stages > 0) == (share > 0.1)
+    assert (cloth.schedule(cloth.rest_state(), {"clamp": still}, t, dt).model.stages > 0) == (share > 0.1)
     moved = (cloth(cloth.state(start), {"clamp": still}, t, dt=dt).x - x)[:, -1, 0] / size
     for wrong, right in ((1.0, True), (1.03, False), (0.97, False)):
         d = wrong * decay

@@ -47,7 +47,7 @@ def test_below_the_limit_nothing_is_touched():
     strain = torch.linalg.svdvals(torch.stack([f1, f2], -1)) - 1
     inside = strain.norm(dim=-1) < LIMIT
     assert int(inside.sum()) > 150
-    virgin = material.start(200)
+    virgin = material.initial_memory(200)
     assert torch.equal(flow(material, f1, f2)[inside], virgin.to(f1)[inside])
     assert bool((flow(material, f1, f2)[~inside] != virgin[~inside]).any(-1).all())
 
@@ -177,11 +177,11 @@ def test_illegal_limits_are_refused(limit):
 
 
 def test_set_appears_in_what_can_be_fitted():
-    from torchcloth.episodes.unknowns import collect
+    from torchcloth.episodes.unknowns import collect_unknowns
     from torchcloth.identification.fit import default_parameters
 
     cloth = tc.Cloth(tc.meshes.rectangle(0.1, 0.1, triangles=20), AEP(1e5, plastic=NormYield(LIMIT)), 0.2)
-    unknowns = {u.name: u for u in collect(cloth, default_parameters(cloth), None)}
+    unknowns = {u.name: u for u in collect_unknowns(cloth, default_parameters(cloth), None)}
     assert "plastic.limit" in unknowns
     assert unknowns["plastic.limit"].value(unknowns["plastic.limit"].start) == pytest.approx(LIMIT)
 
@@ -235,7 +235,7 @@ def test_crushed_triangles_get_the_step_of_small_ones(engine):
     state = crushed(cloth, 0.4)
     with torch.no_grad():
         out = cloth(state, times=[0.0, 0.02, 0.04])
-    kinetic = 0.5 * (cloth.model().mass * out.v**2).sum((-2, -1)).detach()
+    kinetic = 0.5 * (cloth.build_model().mass * out.v**2).sum((-2, -1)).detach()
     assert float(kinetic[1:].max()) < 1.05 * float(kinetic[0])
     with pytest.raises(tc.errors.UnstableStep, match=r"dt; got .* expected at most"):
         cloth(state, times=[0.0, 0.02], dt=cloth.stable_step())
@@ -254,7 +254,7 @@ def test_the_step_follows_the_set_from_frame_to_frame():
     motion = {"hand": tc.Trajectory(t, pose, torch.ones(7, dtype=torch.bool)), "rest": still}
     with torch.no_grad():
         ends = [cloth(cloth.rest_state(), motion, times=t, dt=dt) for dt in (None, 0.1 * cloth.stable_step())]
-    kinetic = [0.5 * float((cloth.model().mass * out.v[-1] ** 2).sum().detach()) for out in ends]
+    kinetic = [0.5 * float((cloth.build_model().mass * out.v[-1] ** 2).sum().detach()) for out in ends]
     assert float(ends[0].state.memory["material"].max()) > 2.0
     assert kinetic[0] == pytest.approx(kinetic[1], rel=0.05)
 

@@ -260,9 +260,9 @@ class TestPlane(BoundaryContract):
 
 class TestGrasp(GraspContract):
     def make(self):
-        return tc.boundaries.Grasp(self.held())
+        return tc.boundaries.Grasp(self.gripped_vertices())
 
-    def held(self):
+    def gripped_vertices(self):
         return [0, 3, 4]
 
 

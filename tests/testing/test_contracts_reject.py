@@ -59,7 +59,7 @@ class DetachedParameter(tc.materials.AEP):
 class YieldsWhenTurned(tc.materials.AEP):
     """The DiffCP paper's |F - 1| <= c: a rotation sets."""
 
-    def start(self, triangles):
+    def initial_memory(self, triangles):
         return torch.eye(2).flatten().expand(triangles, 4)
 
     def flow(self, c, elastic, inelastic):
@@ -148,7 +148,7 @@ class RootOfSpeed(tc.effects.MassDamping):
 
 
 class SilentlyStiff(tc.effects.Bending):
-    def rates(self, c, mass):
+    def stability_bounds(self, c, mass):
         return mass.new_zeros(()), mass.new_zeros(())
 
 
@@ -158,12 +158,12 @@ class TwiceAsViscous(tc.effects.KelvinVoigt):
 
 
 class ViscousWithoutRate(tc.effects.KelvinVoigt):
-    def viscous_rate(self, c, mass):
+    def viscous_stability_bound(self, c, mass):
         return mass.new_zeros(())
 
 
 class StiffAtZero(tc.effects.MassDamping):
-    def rates(self, c, mass):
+    def stability_bounds(self, c, mass):
         return mass.new_full((), 1e9), c.amax()
 
 
@@ -313,9 +313,9 @@ def test_collider(kind, promise):
 def grasp_contract(kind):
     class Contract(GraspContract):
         def make(self):
-            return kind(self.held())
+            return kind(self.gripped_vertices())
 
-        def held(self):
+        def gripped_vertices(self):
             return [0, 3, 4]
 
     return Contract()
@@ -333,12 +333,12 @@ class NeverOpens(tc.boundaries.Grasp):
 
 
 class KeepsQuiet(tc.boundaries.Grasp):
-    def held(self, drive, substep):
+    def prescribed_vertices(self, drive, substep):
         return None
 
 
 class Undriven(tc.boundaries.Grasp):
-    driven = False
+    is_prescribed = False
 
 
 @pytest.mark.parametrize(

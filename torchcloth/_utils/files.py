@@ -14,11 +14,11 @@ from typing import Any
 
 from ..errors import InvalidInput
 
-PROGRESS = "progress"  # folder in an output folder, while the work is not done
+PROGRESS_FOLDER_NAME = "progress"  # folder in an output folder, while the work is not done
 
 
 @contextmanager
-def atomically(path: Path) -> Iterator[Path]:
+def write_atomically(path: Path) -> Iterator[Path]:
     """A name beside ``path`` to write to; it becomes ``path`` when the block ends well, and is removed otherwise."""
     path.parent.mkdir(parents=True, exist_ok=True)
     part = path.with_name(f".{path.stem}.{uuid.uuid4().hex}{path.suffix}")
@@ -38,12 +38,12 @@ def atomically(path: Path) -> Iterator[Path]:
 
 def write_text(path: Path, text: str) -> Path:
     """Write a text file so that a crash leaves the old content or the new, never half; returns its path."""
-    with atomically(path) as part:
+    with write_atomically(path) as part:
         part.write_text(text, encoding="utf-8")
     return path
 
 
-def as_json(content: Any) -> str:
+def to_json(content: Any) -> str:
     """Text of a result; what is not a finite number is null."""
     return json.dumps(_finite(content), indent=1, allow_nan=False) + "\n"
 
@@ -56,7 +56,7 @@ def _finite(value: Any) -> Any:
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
-def check_folder(path: Path, option: str = "--out") -> None:
+def check_output_folder(path: Path, option: str = "--out") -> None:
     """Refuse, before any work is done, a folder that cannot be made or written to; leaves nothing behind.
 
     Raises:

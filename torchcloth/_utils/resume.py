@@ -19,16 +19,16 @@ import torch
 from torch import Tensor
 
 from ..errors import InvalidInput
-from .files import atomically, write_text
+from .files import write_atomically, write_text
 
-FORMAT = 2
-TRIES = 3  # of writing an answer
-STAMP = "problem"  # file that makes a folder a journal
-DAMAGED = (RuntimeError, KeyError, ValueError, EOFError, OSError, pickle.UnpicklingError)  # torch's, of half a file
+STORE_FORMAT_VERSION = 2
+MAX_WRITE_ATTEMPTS = 3  # of writing an answer
+STAMP_FILE_NAME = "problem"  # file that makes a folder a journal
+DAMAGED_FILE_ERRORS = (RuntimeError, KeyError, ValueError, EOFError, OSError, pickle.UnpicklingError)  # torch's, of half a file
 T = TypeVar("T", bound=Sequence)
 
 
-class Journal:
+class ResumableStore:
     """Answers by question in a folder, one file each; no other problem's, though one may be at work there as well.
 
     Args:
@@ -42,9 +42,9 @@ class Journal:
     """
 
     def __init__(self, folder: str | Path, problem: Sequence[object], resume: bool | None) -> None:
-        self.folder, self.key = Path(folder), digest([FORMAT, torch.__version__, program(), *problem])
-        self.recalled = 0
-        stamp = self.folder / STAMP
+        self.folder, self.key = Path(folder), digest([STORE_FORMAT_VERSION, torch.__version__, source_fingerprint(), *problem])
+        self.reused_count = 0
+        stamp = self.folder / STAMP_FILE_NAME
         if not resume:
             if resume is None and stamp.exists():
                 same = stamp.read_text() == self.key
@@ -54,7 +54,7 @@ class Journal:
                     expected="--resume, to go on from there, or another folder" if same else "another folder",
                     remedy=f"to start over, delete {self.folder}",
                 )
-            clear(self.folder)
+            clear_store(self.folder)
             return
         if not stamp.exists():
             raise InvalidInput(
@@ -71,40 +71,40 @@ class Journal:
                 remedy=f"to start over, delete {self.folder}",
             )
 
-    def ask(self, question: str, raw: Tensor, work: Callable[[], T]) -> T:
+    def get_or_compute(self, name: str, inputs: Tensor, compute: Callable[[], T]) -> T:
         """The answer of before, or that of ``work``, which is kept: a tuple of tensors."""
-        path = self.folder / f"{question}-{digest([self.key, raw])}.pt"
+        path = self.folder / f"{name}-{digest([self.key, inputs])}.pt"
         try:
             answer = torch.load(path, weights_only=True)
-            self.recalled += 1
+            self.reused_count += 1
             return answer
-        except DAMAGED:
-            answer = work()
+        except DAMAGED_FILE_ERRORS:
+            answer = compute()
         self._write(path, tuple(answer))
         return answer
 
     def _write(self, path: Path, answer: tuple) -> None:
-        for _ in range(TRIES):  # another run into this folder that has ended takes it away
+        for _ in range(MAX_WRITE_ATTEMPTS):  # another run into this folder that has ended takes it away
             with suppress(FileNotFoundError):
-                if not (self.folder / STAMP).exists():
-                    write_text(self.folder / STAMP, self.key)  # several answers may come at once
-                with atomically(path) as part:
+                if not (self.folder / STAMP_FILE_NAME).exists():
+                    write_text(self.folder / STAMP_FILE_NAME, self.key)  # several answers may come at once
+                with write_atomically(path) as part:
                     torch.save(answer, part)
                 return
 
 
 @cache
-def program(*beside: Path) -> str:
+def source_fingerprint(*more_folders: Path) -> str:
     """A fingerprint of the sources of the library, and of folders beside: what other code said is no answer."""
     folders = [Path(str(files(name))) for name in ("torchcloth", "torchcloth.robots")]
     parts: list[object] = []
-    for folder in (*folders, *beside):
+    for folder in (*folders, *more_folders):
         sources = sorted(p for p in folder.rglob("*") if p.suffix in (".py", ".h", ".cpp"))
         parts += [part for p in sources for part in (p.relative_to(folder).as_posix(), p.read_bytes())]
     return digest(parts)
 
 
-def clear(folder: Path) -> None:
+def clear_store(folder: Path) -> None:
     """Remove a journal, if there is one: its stamp last, so that what is left by an interruption is a journal still.
 
     Raises:
@@ -112,9 +112,9 @@ def clear(folder: Path) -> None:
     """
     if not folder.exists():
         return
-    stamp = folder / STAMP
+    stamp = folder / STAMP_FILE_NAME
     inside = [path for path in folder.iterdir() if path != stamp]
-    if not stamp.exists() and any(not path.name.startswith(f".{STAMP}.") for path in inside):  # these are half a stamp
+    if not stamp.exists() and any(not path.name.startswith(f".{STAMP_FILE_NAME}.") for path in inside):  # these are half a stamp
         raise InvalidInput("journal", got=f"{folder} with other content", expected="a new folder, or a journal")
     for path in (*inside, stamp):
         path.unlink(missing_ok=True)

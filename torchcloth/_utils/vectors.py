@@ -11,35 +11,35 @@ from torch import Tensor
 from ..errors import InvalidInput
 
 
-def direction(what: str, given: Sequence[float]) -> Tensor:
+def parse_unit_vector(what: str, given: Sequence[float]) -> Tensor:
     """[3] unit vector.
 
     Raises:
         InvalidInput: not three finite numbers, or all zero.
     """
-    vector = place(what, given)
+    vector = parse_vector(what, given)
     length = float(vector.norm())
     if not 0 < length < math.inf:
         raise InvalidInput(what, got=given, expected="three finite numbers, not all zero")
     return vector / length
 
 
-def place(what: str, given: Sequence[float]) -> Tensor:
+def parse_vector(what: str, given: Sequence[float]) -> Tensor:
     """[3] a point or vector.
 
     Raises:
         InvalidInput: not three finite numbers.
     """
-    return numbers(what, given, 3, "three finite numbers")
+    return parse_finite_numbers(what, given, 3, "three finite numbers")
 
 
-def numbers(what: str, given: Sequence[float], count: int, expected: str) -> Tensor:
+def parse_finite_numbers(what: str, given: Sequence[float], count: int, expected: str) -> Tensor:
     """[count] finite numbers, which ``expected`` describes.
 
     Raises:
         InvalidInput: something else.
     """
-    check_value(what, given)
+    check_has_no_gradient(what, given)
     try:
         vector = torch.as_tensor(given, dtype=torch.get_default_dtype())
     except (TypeError, ValueError, RuntimeError) as error:
@@ -49,7 +49,7 @@ def numbers(what: str, given: Sequence[float], count: int, expected: str) -> Ten
     return vector
 
 
-def check_value(what: str, given: object) -> None:
+def check_has_no_gradient(what: str, given: object) -> None:
     """Refuse a tensor whose gradients would be lost, as a part keeps a copy.
 
     Raises:

@@ -1,11 +1,11 @@
 """Where the cloth meets the world: grasps and colliders, applied in order. Motion is an input, never an attribute."""
 
-from .base import AbstractBoundary, Drive
+from .base import AbstractBoundary, PrescribedMotion
 from .collider import AbstractCollider
 from .friction import Coulomb, Elliptic, Stribeck
 from .grasp import Grasp
 from .mesh_solid import MeshSolid
-from .motion import drive
+from .motion import sample_trajectory
 from .plane import Plane
 from .solids import Box, Capsule, Cylinder, Sphere
 
@@ -16,12 +16,12 @@ __all__ = [
     "Capsule",
     "Coulomb",
     "Cylinder",
-    "Drive",
+    "PrescribedMotion",
     "Elliptic",
     "Grasp",
     "MeshSolid",
     "Plane",
     "Sphere",
     "Stribeck",
-    "drive",
+    "sample_trajectory",
 ]

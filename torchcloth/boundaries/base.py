@@ -10,7 +10,7 @@ from torch import Tensor, nn
 from ..meshes import Mesh
 
 
-class Drive(NamedTuple):
+class PrescribedMotion(NamedTuple):
     """A trajectory resolved on the substeps of one frame interval."""
 
     increment: Tensor  # [..., N, 4, 4] rigid motion of the world points carried along during each substep
@@ -24,7 +24,7 @@ class AbstractBoundary(nn.Module, ABC):
     ``driven`` boundaries need a trajectory in ``motion``; the layer reports the wrench that the cloth exerts on them.
     """
 
-    driven: bool = False
+    is_prescribed: bool = False
 
     @abstractmethod
     def bind(self, mesh: Mesh) -> AbstractBoundary:
@@ -34,10 +34,10 @@ class AbstractBoundary(nn.Module, ABC):
             InvalidInput: the boundary does not fit the mesh.
         """
 
-    def held(self, drive: Drive | None, substep: int) -> Tensor | None:
+    def prescribed_vertices(self, prescribed: PrescribedMotion | None, substep: int) -> Tensor | None:
         """Indices of the vertices whose velocities it dictates whatever they are; None: of none."""
         return None
 
     @abstractmethod
-    def constrain(self, x: Tensor, v: Tensor, dt: float, drive: Drive | None, substep: int) -> Tensor:
+    def constrain(self, x: Tensor, v: Tensor, dt: float, prescribed: PrescribedMotion | None, substep: int) -> Tensor:
         """New velocities [..., V, 3] from positions at the start of the substep and velocities free of the boundary."""

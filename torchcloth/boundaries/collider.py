@@ -9,20 +9,20 @@ from typing import NamedTuple, TypedDict, cast
 import torch
 from torch import Tensor
 
-from .._utils.linalg import displacement, dot, times, withheld
-from .._utils.vectors import check_value
+from .._utils.linalg import rigid_displacement, dot, matvec, added_mass_correction
+from .._utils.vectors import check_has_no_gradient
 from ..errors import InvalidInput
 from ..meshes import Mesh
-from .base import AbstractBoundary, Drive
+from .base import AbstractBoundary, PrescribedMotion
 from .friction import Coulomb
 from .points import TrianglePoints
 
 # Over the points on triangles in a substep. A cube's corner pushed into a sheet at 1 m/s, points every 5 mm, gets
 # 5.1 mm deep with one pass, 2.8 with two, 1.7 with three and with six (between the points).
-PASSES = 3
+CONTACT_PASSES = 3
 
 
-class Options(TypedDict, total=False):
+class ColliderOptions(TypedDict, total=False):
     """What all colliders take beside shape and friction; see ``AbstractCollider``."""
 
     moving: bool
@@ -74,7 +74,7 @@ class AbstractCollider(AbstractBoundary):
         if not 0 < recovery < math.inf:
             raise InvalidInput("recovery", got=f"{recovery:g} m/s", expected="a speed > 0")
         self.friction = friction if isinstance(friction, Coulomb) else Coulomb(friction)
-        self.driven = bool(moving)
+        self.is_prescribed = bool(moving)
         self.offset, self.sampling, self.recovery = float(offset), sampling, float(recovery)
         self.points: TrianglePoints | None = None
         self.register_buffer("pose", None if pose is None else _rigid(pose), persistent=False)
@@ -109,9 +109,9 @@ class AbstractCollider(AbstractBoundary):
         x: Tensor,
         v: Tensor,
         dt: float,
-        drive: Drive | None,
+        prescribed: PrescribedMotion | None,
         substep: int,
-        resistance: Tensor | None = None,
+        added_mass_ratio: Tensor | None = None,
         mass: Tensor | None = None,
     ) -> Tensor:
         """Stop what approaches; first the points on edges and triangles, then, exactly, the vertices.
@@ -119,15 +119,15 @@ class AbstractCollider(AbstractBoundary):
         ``resistance`` [..., V, 3, 3] is the mass of the air that moves along, over the vertices' own; None: none does.
         ``mass`` [..., V, 1] of the vertices, in any unit; None: all have the same.
         """
-        motion = (None, None) if drive is None else (d[..., substep, :, :] for d in (drive.increment, drive.pose))
+        motion = (None, None) if prescribed is None else (d[..., substep, :, :] for d in (prescribed.increment, prescribed.pose))
         place = self._placed(*motion)
         if self.points is not None:
-            air = None if resistance is None else self.points.at(resistance.flatten(-2)).unflatten(-1, (3, 3))
-            contact = self._contact(self.points.at(x), dt, place, air)
+            air = None if added_mass_ratio is None else self.points.interpolate(added_mass_ratio.flatten(-2)).unflatten(-1, (3, 3))
+            contact = self._contact(self.points.interpolate(x), dt, place, air)
             mass = torch.ones_like(v[..., :1]) if mass is None else mass
-            for _ in range(PASSES):
-                v = v + self.points.share(self._change(contact, self.points.at(v)), mass)
-        return v + self._change(self._contact(x, dt, place, resistance), v)
+            for _ in range(CONTACT_PASSES):
+                v = v + self.points.distribute(self._change(contact, self.points.interpolate(v)), mass)
+        return v + self._change(self._contact(x, dt, place, added_mass_ratio), v)
 
     def _placed(self, increment: Tensor | None, pose: Tensor | None) -> _Place:
         own = self.pose
@@ -148,16 +148,16 @@ class AbstractCollider(AbstractBoundary):
         push = (least - approach).clamp(min=0)
         slip = slip - approach * normal
         if air is None:
-            return place.outwards(push * normal - self.friction.taken(slip, push) * slip)
+            return place.outwards(push * normal - self.friction.slip_reduction(slip, push) * slip)
         aside = push * air.aside
         slip = slip + aside
-        taken = self.friction.taken(slip, push * air.pushed(slip))
+        taken = self.friction.slip_reduction(slip, push * air.pushed(slip))
         return place.outwards(push * normal + aside - taken * slip)
 
     def extra_repr(self) -> str:
         """One line of the data sheet."""
         sampled = "vertices" if self.sampling is None else f"points every {self.sampling:g} m"
-        return f"{'moving' if self.driven else 'fixed'}, offset={self.offset:g} m, {sampled}"
+        return f"{'moving' if self.is_prescribed else 'fixed'}, offset={self.offset:g} m, {sampled}"
 
 
 class _Place(NamedTuple):
@@ -168,7 +168,7 @@ class _Place(NamedTuple):
 
     def way(self, x: Tensor) -> Tensor | None:
         """How far the body's motion carries world points; None: it stands still."""
-        return None if self.increment is None else displacement(self.increment, x)
+        return None if self.increment is None else rigid_displacement(self.increment, x)
 
     def inside(self, x: Tensor) -> Tensor:
         """World points in the shape's coordinates."""
@@ -213,7 +213,7 @@ class _Air(NamedTuple):
     @classmethod
     def of(cls, resistance: Tensor, normal: Tensor) -> _Air:
         """W n = n - (1 + B)^-1 B n answers the impulse n: over n . W n, what changes the normal velocity by 1."""
-        less = withheld(resistance, normal)
+        less = added_mass_correction(resistance, normal)
         along = dot(less, normal)
         push = 1 / (1 - along)
         return cls(resistance, push * (along * normal - less), push)
@@ -221,12 +221,12 @@ class _Air(NamedTuple):
     def pushed(self, slip: Tensor) -> Tensor:
         """Push that counts for friction, of 1: as inertia along the normal is more, and along the slip [..., N, 3]."""
         squared = dot(slip, slip)
-        along = dot(slip, times(self.resistance, slip))
+        along = dot(slip, matvec(self.resistance, slip))
         return self.push / (1 + along / torch.where(squared > 0, squared, 1.0))
 
 
 def _rigid(pose: Tensor) -> Tensor:
-    check_value("pose", pose)
+    check_has_no_gradient("pose", pose)
     try:
         matrix = torch.as_tensor(pose).detach().to(torch.get_default_dtype())
     except (TypeError, ValueError, RuntimeError):

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from .._utils.linalg import dot, safe_norm
-from .._utils.vectors import direction
+from .._utils.vectors import parse_unit_vector
 from ..errors import InvalidInput
 from ..parameters import PhysicalParameter
 
@@ -27,7 +27,7 @@ class Coulomb(PhysicalParameter):
         super().__init__(friction, "-", "nonnegative", name="friction")
         check_scalar("friction", self)
 
-    def taken(self, slip: Tensor, push: Tensor) -> Tensor:
+    def slip_reduction(self, slip: Tensor, push: Tensor) -> Tensor:
         """Share of the slip that is lost [..., N, 1]; 1 where the surfaces stick.
 
         Args:
@@ -92,7 +92,7 @@ class Elliptic(Coulomb):
         if not bool((self.raw > 0).all()):
             raise InvalidInput("along", got=f"{float(self.raw.min()):g}", expected="a coefficient > 0")
         self.ratio = PhysicalParameter(across / along, "-", name="friction across over along")
-        self.register_buffer("axis", direction("friction axis", axis), persistent=False)
+        self.register_buffer("axis", parse_unit_vector("friction axis", axis), persistent=False)
         self.axis: Tensor
 
     def _size(self, slip: Tensor) -> Tensor:

@@ -11,10 +11,10 @@ import torch
 from numpy.typing import ArrayLike
 from torch import Tensor
 
-from .._utils.linalg import displacement
+from .._utils.linalg import rigid_displacement
 from ..errors import InvalidInput
 from ..meshes import Mesh
-from .base import AbstractBoundary, Drive
+from .base import AbstractBoundary, PrescribedMotion
 
 Corner = Literal["lower-left", "lower-right", "upper-left", "upper-right"]
 
@@ -34,7 +34,7 @@ class Grasp(AbstractBoundary):
         InvalidInput: both or neither of vertices and uv; a patch that holds no vertex.
     """
 
-    driven = True
+    is_prescribed = True
 
     def __init__(
         self, vertices: Sequence[int] | None = None, *, uv: ArrayLike | None = None, radius: float = 0.015
@@ -77,13 +77,13 @@ class Grasp(AbstractBoundary):
         """
         return None if self._uv is None else np.atleast_2d(self._uv)
 
-    def moved(self, wider: float, along: float) -> Grasp:
+    def shifted(self, wider: float, along: float) -> Grasp:
         """The same vertices, where a mesh has them ``wider`` [m] farther out and ``along`` [m] further along u."""
         if self.uv is None:
             raise InvalidInput("Grasp.moved", got="a patch without a place", expected="one that was given by uv")
-        return Grasp(uv=self.uv + np.array([along, 0.0]), radius=self.radius + wider).holding(self.index)
+        return Grasp(uv=self.uv + np.array([along, 0.0]), radius=self.radius + wider).with_vertices(self.index)
 
-    def holding(self, vertices: Tensor) -> Grasp:
+    def with_vertices(self, vertices: Tensor) -> Grasp:
         """The same patch or place with these vertices [H] in it, whatever a mesh has there."""
         grasp = copy.deepcopy(self)
         grasp.index, grasp._stays = vertices.clone(), True
@@ -104,7 +104,7 @@ class Grasp(AbstractBoundary):
 
     def _find(self, mesh: Mesh) -> None:
         if self._place is not None:
-            self.index = torch.as_tensor(mesh.around(self._place, self.radius), device=self.index.device)
+            self.index = torch.as_tensor(mesh.vertices_at_place(self._place, self.radius), device=self.index.device)
         if self._corner is not None:
             uv = mesh.uv
             if uv is None:
@@ -116,17 +116,17 @@ class Grasp(AbstractBoundary):
             vertical, horizontal = self._corner.split("-")
             self._uv = [[(low if horizontal == "left" else high)[0], (low if vertical == "lower" else high)[1]]]
         if self._uv is not None:
-            self.index = torch.as_tensor(mesh.nearest_vertices(self._uv, self.radius), device=self.index.device)
+            self.index = torch.as_tensor(mesh.vertices_near_pattern_points(self._uv, self.radius), device=self.index.device)
 
-    def held(self, drive: Drive | None, substep: int) -> Tensor | None:
+    def prescribed_vertices(self, prescribed: PrescribedMotion | None, substep: int) -> Tensor | None:
         """All while it is closed."""
-        return self.index if drive is not None and drive.closed[substep] else None
+        return self.index if prescribed is not None and prescribed.closed[substep] else None
 
-    def constrain(self, x: Tensor, v: Tensor, dt: float, drive: Drive | None, substep: int) -> Tensor:
+    def constrain(self, x: Tensor, v: Tensor, dt: float, prescribed: PrescribedMotion | None, substep: int) -> Tensor:
         """Held vertices arrive exactly where the body carries them."""
-        if drive is None or self.held(drive, substep) is None:
+        if prescribed is None or self.prescribed_vertices(prescribed, substep) is None:
             return v
-        wanted = displacement(drive.increment[..., substep, :, :], x.index_select(-2, self.index)) / dt
+        wanted = rigid_displacement(prescribed.increment[..., substep, :, :], x.index_select(-2, self.index)) / dt
         v = v.expand(*wanted.shape[:-2], *v.shape[-2:])
         return v.index_copy(-2, self.index, wanted)
 

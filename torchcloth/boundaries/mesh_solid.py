@@ -12,12 +12,12 @@ from torch import Tensor
 
 from .._utils.linalg import safe_norm
 from ..errors import InvalidInput, MissingDependency
-from ..meshes.topology import edges
-from .collider import AbstractCollider, Options
+from ..meshes.topology import find_edges
+from .collider import AbstractCollider, ColliderOptions
 from .friction import Coulomb
 
-MARGIN = 2  # cells of the grid around the solid
-MOST = 2**25  # nodes of the grid: 256 MiB in float64
+GRID_MARGIN_CELLS = 2  # cells of the grid around the solid
+MAX_GRID_NODES = 2**25  # nodes of the grid: 256 MiB in float64
 
 
 class MeshSolid(AbstractCollider):
@@ -46,7 +46,7 @@ class MeshSolid(AbstractCollider):
         cell: float | None = None,
         pose: Tensor | None = None,
         friction: float | Coulomb = 0.4,
-        **options: Unpack[Options],
+        **options: Unpack[ColliderOptions],
     ) -> None:
         super().__init__(friction, pose=pose, **options)
         x, f = _closed(np.array(vertices, np.float64), np.array(faces, np.int64))
@@ -54,13 +54,13 @@ class MeshSolid(AbstractCollider):
         cell = float(extent.max() / 48 if cell is None else cell)
         if not 0 < cell < np.inf:
             raise InvalidInput("cell", got=f"{cell:g} m", expected="a length > 0")
-        count = np.ceil(extent / cell - 1e-9) + 1 + 2 * MARGIN
-        if count.prod() > MOST:
+        count = np.ceil(extent / cell - 1e-9) + 1 + 2 * GRID_MARGIN_CELLS
+        if count.prod() > MAX_GRID_NODES:
             raise InvalidInput(
                 "cell",
                 got=f"{cell:g} m, which asks for {count.prod():.3g} grid nodes",
-                expected=f"at most {MOST:.3g} nodes",
-                remedy=f"take a cell of {cell * (count.prod() / MOST) ** (1 / 3):.2g} m or more",
+                expected=f"at most {MAX_GRID_NODES:.3g} nodes",
+                remedy=f"take a cell of {cell * (count.prod() / MAX_GRID_NODES) ** (1 / 3):.2g} m or more",
             )
         origin = low + extent / 2 - (count - 1) / 2 * cell
         axes = [origin[k] + cell * np.arange(int(count[k])) for k in range(3)]
@@ -119,7 +119,7 @@ def _closed(x: np.ndarray, f: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     if f.min() < 0 or f.max() >= len(x):
         raise InvalidInput("solid mesh", got=f"vertex index {f.max()}", expected=f"indices in 0..{len(x) - 1}")
     x, f = x[np.unique(f)], np.unique(f, return_inverse=True)[1].reshape(-1, 3)
-    open_edges = int((edges(f)[1] != 2).sum())
+    open_edges = int((find_edges(f)[1] != 2).sum())
     if open_edges or np.linalg.norm(np.ptp(x, axis=0)) == 0 or np.ptp(x, axis=0).min() == 0:
         raise InvalidInput(
             "solid mesh",

@@ -11,14 +11,14 @@ from functools import partial
 import torch
 from torch import Tensor
 
-from .._utils.caching import Recent, size_of
-from .._utils.linalg import cross, dot, hermite, last_knot
+from .._utils.caching import LRUCache, bytes_of
+from .._utils.linalg import cross, dot, interpolate_hermite, find_last_knot
 from ..errors import InvalidInput
 from ..types import Trajectory
-from .base import Drive
+from .base import PrescribedMotion
 
 
-def check(trajectory: Trajectory, name: str) -> None:
+def check_trajectory(trajectory: Trajectory, name: str) -> None:
     """Refuse a trajectory that cannot be followed.
 
     Raises:
@@ -30,10 +30,10 @@ def check(trajectory: Trajectory, name: str) -> None:
         parts = trajectory if isinstance(trajectory, Trajectory) else (trajectory,)
         got = ", ".join(type(part).__name__ for part in parts)
         raise InvalidInput(where, got=got, expected="a Trajectory of tensors t, pose and closed")
-    _SOUND.by_content(trajectory, partial(_check, trajectory, where))
+    _CHECKED_TRAJECTORIES.get_by_value(trajectory, partial(_check, trajectory, where))
 
 
-_SOUND: Recent[None] = Recent(16 * 2**20, lambda _: 0)  # what was checked
+_CHECKED_TRAJECTORIES: LRUCache[None] = LRUCache(16 * 2**20, lambda _: 0)  # what was checked
 
 
 def _check(trajectory: Trajectory, where: str) -> None:
@@ -79,7 +79,7 @@ def _check(trajectory: Trajectory, where: str) -> None:
         )
 
 
-def check_cover(trajectory: Trajectory, name: str, start: float, end: float) -> None:
+def check_covers_times(trajectory: Trajectory, name: str, start: float, end: float) -> None:
     """Refuse a trajectory that does not cover [start, end] s.
 
     Raises:
@@ -95,7 +95,7 @@ def check_cover(trajectory: Trajectory, name: str, start: float, end: float) -> 
         )
 
 
-def interpolate(trajectory: Trajectory, times: Tensor) -> Tensor:
+def interpolate_poses(trajectory: Trajectory, times: Tensor) -> Tensor:
     """Poses [..., N, 4, 4] at ``times`` [N] s: cubic Hermite on positions and rotation columns, orthonormalised.
 
     C1, so that the held cloth sees no velocity jumps at the knots; differentiable in the knots' poses. Times are
@@ -107,7 +107,7 @@ def interpolate(trajectory: Trajectory, times: Tensor) -> Tensor:
     if len(t) == 1:
         return pose.expand(*pose.shape[:-3], len(times), 4, 4)
     told = torch.cat([pose[..., :3, :2], pose[..., :3, 3:]], dim=-1)  # the third column follows from the first two
-    mixed = hermite(t, told, _slopes(t, told), times)
+    mixed = interpolate_hermite(t, told, _slopes(t, told), times)
     first = mixed[..., 0]
     first = first * dot(first, first).rsqrt()
     second = mixed[..., 1]
@@ -118,29 +118,29 @@ def interpolate(trajectory: Trajectory, times: Tensor) -> Tensor:
     return torch.cat([top, pose.new_tensor([0.0, 0.0, 0.0, 1.0]).expand(*top.shape[:-2], 1, 4)], dim=-2)
 
 
-def drive(trajectory: Trajectory, times: Tensor) -> Drive:
+def sample_trajectory(trajectory: Trajectory, times: Tensor) -> PrescribedMotion:
     """Increments of motion over the substeps between consecutive ``times`` [N + 1] s, in the poses' precision.
 
     They are resolved in float64: what float32 loses of a substep is alike in all of them, and would carry a body that
     stands still by a millimetre a second. Fits ask for the same again and again: nobody may write to one.
     """
-    return _DRIVES.by_content((*trajectory, times), partial(_resolved, trajectory, times))
+    return _SAMPLED_TRAJECTORIES.get_by_value((*trajectory, times), partial(_sample_trajectory, trajectory, times))
 
 
-_DRIVES: Recent[Drive] = Recent(64 * 2**20, lambda d: size_of(d.increment, d.pose))
+_SAMPLED_TRAJECTORIES: LRUCache[PrescribedMotion] = LRUCache(64 * 2**20, lambda d: bytes_of(d.increment, d.pose))
 
 
-def _resolved(trajectory: Trajectory, times: Tensor) -> Drive:
+def _sample_trajectory(trajectory: Trajectory, times: Tensor) -> PrescribedMotion:
     given = trajectory.pose
-    pose = interpolate(trajectory._replace(pose=given.double()), times)
+    pose = interpolate_poses(trajectory._replace(pose=given.double()), times)
     before, after = pose[..., :-1, :, :], pose[..., 1:, :, :]
     turn = after[..., :3, :3] @ before[..., :3, :3].mT
     shift = after[..., :3, 3:] - turn @ before[..., :3, 3:]
     increment = torch.cat([torch.cat([turn, shift], dim=-1), after[..., 3:, :]], dim=-2)
     t = trajectory.t.to(times)
-    knot = last_knot(t, times[:-1] + _slack(trajectory.t)).clamp(min=0)
+    knot = find_last_knot(t, times[:-1] + _slack(trajectory.t)).clamp(min=0)
     closed = trajectory.closed.cpu()[knot.cpu()]
-    return Drive(increment.to(given), after.to(given), tuple(closed.tolist()))
+    return PrescribedMotion(increment.to(given), after.to(given), tuple(closed.tolist()))
 
 
 def _slack(t: Tensor) -> float:

@@ -8,9 +8,9 @@ from typing import Unpack
 from torch import Tensor
 
 from .._utils.linalg import dot
-from .._utils.vectors import direction, place
+from .._utils.vectors import parse_unit_vector, parse_vector
 from ..errors import InvalidInput
-from .collider import AbstractCollider, Options
+from .collider import AbstractCollider, ColliderOptions
 from .friction import Coulomb, Elliptic
 
 
@@ -32,11 +32,11 @@ class Plane(AbstractCollider):
         point: Sequence[float] = (0.0, 0.0, 0.0),
         normal: Sequence[float] = (0.0, 0.0, 1.0),
         friction: float | Coulomb = 0.4,
-        **options: Unpack[Options],
+        **options: Unpack[ColliderOptions],
     ) -> None:
         super().__init__(friction, **options)
-        self.register_buffer("point", place("plane point", point), persistent=False)
-        self.register_buffer("normal", direction("plane normal", normal), persistent=False)
+        self.register_buffer("point", parse_vector("plane point", point), persistent=False)
+        self.register_buffer("normal", parse_unit_vector("plane normal", normal), persistent=False)
         self.point: Tensor
         self.normal: Tensor
         if isinstance(friction, Elliptic) and float((friction.axis * self.normal).sum().abs()) > 1e-5:

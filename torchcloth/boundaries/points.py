@@ -8,11 +8,11 @@ from torch import Tensor, nn
 
 from .._utils.linalg import dot
 from ..meshes import Mesh
-from ..meshes.topology import edges
+from ..meshes.topology import find_edges
 
 # Changes of velocity below it [m/s] are no contact. What a pass has stopped is left with rounding, of either sign; if
 # that counted, a point's neighbours would get their full share of the mass or not by chance.
-TOUCH = 1e-6
+MIN_CONTACT_SPEED_CHANGE_M_PER_S = 1e-6
 
 
 class TrianglePoints(nn.Module):
@@ -32,11 +32,11 @@ class TrianglePoints(nn.Module):
         self.index: Tensor  # [3 P], first all first corners, then all second, then all third
         self.weight: Tensor  # [3, P, 1]
 
-    def at(self, field: Tensor) -> Tensor:
+    def interpolate(self, field: Tensor) -> Tensor:
         """Values [..., P, 3] at the points, of values [..., V, 3] at the vertices."""
         return (self.weight * self._corners(field)).sum(-3)
 
-    def share(self, change: Tensor, mass: Tensor) -> Tensor:
+    def distribute(self, change: Tensor, mass: Tensor) -> Tensor:
         """Changes of the vertices' velocities [..., V, 3] that answer the wanted changes [..., P, 3] of the points.
 
         Each vertex splits its ``mass`` [..., V, 1] among its points that touch the body, by weight (mass splitting:
@@ -46,7 +46,7 @@ class TrianglePoints(nn.Module):
         """
         vertices = mass.shape[-2]
         with torch.no_grad():
-            touches = (dot(change, change) > TOUCH**2).to(change)
+            touches = (dot(change, change) > MIN_CONTACT_SPEED_CHANGE_M_PER_S**2).to(change)
             claims = self._corners(self._gathered(self.weight * touches.unsqueeze(-3), vertices))
         light = self.weight / self._corners(mass)
         mobility = (light * claims).sum(-3)  # of a point that has its corners' parts of mass m b / sum(b)
@@ -65,7 +65,7 @@ class TrianglePoints(nn.Module):
 
 def _lattice(faces: np.ndarray, parts: int) -> tuple[np.ndarray, np.ndarray]:
     """(corners [P, 3], weights [P, 3]) of edges and triangles in ``parts`` equal parts, without the vertices."""
-    sides = edges(faces)[0]
+    sides = find_edges(faces)[0]
     index, weight = [np.zeros((0, 3), np.int64)], [np.zeros((0, 3))]
     for i in range(1, parts):
         index.append(sides[:, [0, 1, 1]])

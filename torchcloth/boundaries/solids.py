@@ -9,10 +9,10 @@ import torch
 from torch import Tensor
 
 from .._utils.linalg import cross, dot, safe_norm
-from .._utils.vectors import place
+from .._utils.vectors import parse_vector
 from ..errors import InvalidInput
 from ..parameters import PhysicalParameter
-from .collider import AbstractCollider, Options
+from .collider import AbstractCollider, ColliderOptions
 from .friction import Coulomb, check_scalar, per_point
 
 
@@ -34,13 +34,13 @@ class Sphere(AbstractCollider):
         radius: float,
         centre: Sequence[float] = (0.0, 0.0, 0.0),
         friction: float | Coulomb = 0.4,
-        **options: Unpack[Options],
+        **options: Unpack[ColliderOptions],
     ) -> None:
         super().__init__(friction, **options)
         self.radius = PhysicalParameter(radius, "m", name="radius")
         check_scalar("radius", self.radius)
-        self.register_buffer("centre", place("centre", centre), persistent=False)
-        self.register_buffer("up", place("up", (0.0, 0.0, 1.0)), persistent=False)
+        self.register_buffer("centre", parse_vector("centre", centre), persistent=False)
+        self.register_buffer("up", parse_vector("up", (0.0, 0.0, 1.0)), persistent=False)
         self.centre: Tensor
         self.up: Tensor
 
@@ -68,10 +68,10 @@ class Box(AbstractCollider):
         size: Sequence[float],
         pose: Tensor | None = None,
         friction: float | Coulomb = 0.4,
-        **options: Unpack[Options],
+        **options: Unpack[ColliderOptions],
     ) -> None:
         super().__init__(friction, pose=pose, **options)
-        self.size = PhysicalParameter(place("box size", size), "m", name="box size")
+        self.size = PhysicalParameter(parse_vector("box size", size), "m", name="box size")
 
     def distance(self, p: Tensor) -> tuple[Tensor, Tensor]:
         """To the nearest face, edge or corner."""
@@ -89,10 +89,10 @@ class _Axial(AbstractCollider):
         end: Sequence[float],
         radius: float,
         friction: float | Coulomb = 0.4,
-        **options: Unpack[Options],
+        **options: Unpack[ColliderOptions],
     ) -> None:
         super().__init__(friction, **options)
-        a, b = place("start", start), place("end", end)
+        a, b = parse_vector("start", start), parse_vector("end", end)
         if not float((b - a).norm()) > 0:
             raise InvalidInput("axis", got=f"from {start} to {end}", expected="two different points")
         self.radius = PhysicalParameter(radius, "m", name="radius")

@@ -1,6 +1,7 @@
 """The physics of one substep: kinematics, elasticity, forces, viscous stages, contact between layers, stability."""
 
-from .model import Geometry, Model, surface
+from .kinematics import Geometry, surface
+from .model import Model
 from .substep import energy, rollout, step
 
 __all__ = ["Geometry", "Model", "energy", "rollout", "step", "surface"]

@@ -1,4 +1,8 @@
-"""Elastic strain of a sheet whose rest shape is not its pattern: grown, shrunk or plastically set."""
+"""Elastic strain and stress of a sheet whose rest shape is not its pattern: grown, shrunk or plastically set.
+
+With the deformation gradient F of the pattern, the elastic deformation is F_E = F A. A is the inverse of the rest
+deformation, times the inverse of the plastic set where the material yields. Stored by rows: (A11, A12, A21, A22).
+"""
 
 from __future__ import annotations
 
@@ -9,55 +13,61 @@ from torch import Tensor
 
 from .._utils.linalg import cross
 from ..errors import InvalidInput
-from ..types import ClothState, Memory, Moment, Surface
+from ..types import ClothState, EffectInputs, Memory, Surface
 from .model import Model
 
-MATERIAL = "material"  # key of the plastic set among the internal variables
+MATERIAL_MEMORY_KEY = "material"  # the plastic set, among the internal variables
 
 
-def evolve(model: Model, state: ClothState, s: Surface, dt: float, lost: Tensor | None = None) -> Memory:
-    """Plastic set, internal friction and creases follow the cloth to where it is now, ``dt`` [s] later."""
+def update_memory(
+    model: Model, state: ClothState, s: Surface, dt: float, compensation: Tensor | None = None
+) -> Memory:
+    """Advance plastic set, internal friction and creases to the present deformation, ``dt`` [s] after the last time."""
     memory = dict(state.memory)
-    if MATERIAL in memory:
-        trial, _ = elastic(model, s, memory)
-        memory[MATERIAL] = model.material.flow(model.coefficients, trial, memory[MATERIAL])
+    if MATERIAL_MEMORY_KEY in memory:
+        trial, _ = elastic_deformation(model, s, memory)
+        memory[MATERIAL_MEMORY_KEY] = model.material.flow(model.coefficients, trial, memory[MATERIAL_MEMORY_KEY])
     for name, (effect, c) in model.effects.items():
-        own = memory.get(f"effects.{name}")
-        if own is not None:
-            memory[f"effects.{name}"] = effect.evolve(c, Moment(state.x, state.v, s, model.mass, own, dt, lost))
+        variables = memory.get(f"effects.{name}")
+        if variables is not None:
+            inputs = EffectInputs(state.x, state.v, s, model.mass, variables, dt, compensation)
+            memory[f"effects.{name}"] = effect.update_memory(c, inputs)
     return memory
 
 
-def elastic(model: Model, s: Surface, memory: Memory) -> tuple[Surface, Tensor | None]:
-    """(elastic deformation F A, true rest area over the pattern's or None for 1)."""
-    share = None
-    if model.rest is not None:
-        s = _seen_from(s, model.rest)
-        share = 1 / _determinant(model.rest)
-    return (_seen_from(s, memory[MATERIAL]) if MATERIAL in memory else s), share
+def elastic_deformation(model: Model, s: Surface, memory: Memory) -> tuple[Surface, Tensor | None]:
+    """Return the elastic deformation F A, and the true rest area over the pattern's (None for 1)."""
+    area_share = None
+    if model.inverse_rest_deformation is not None:
+        s = _change_rest_shape(s, model.inverse_rest_deformation)
+        area_share = 1 / _determinant(model.inverse_rest_deformation)
+    return (_change_rest_shape(s, memory[MATERIAL_MEMORY_KEY]) if MATERIAL_MEMORY_KEY in memory else s), area_share
 
 
 def membrane_stress(model: Model, s: Surface, memory: Memory) -> tuple[Tensor, Tensor]:
-    """Columns of d(energy)/dF per area of the pattern [..., E, 3] N/m: P = P_E A^T, times the growth of the area."""
-    strained, share = elastic(model, s, memory)
+    """Compute the columns of d(energy)/dF per area of the pattern, each [..., E, 3] N/m.
+
+    P = P_E A^T, times the true rest area over the pattern's.
+    """
+    strained, area_share = elastic_deformation(model, s, memory)
     p1, p2 = model.material.membrane_stress(model.coefficients, strained)
-    for inverse in (memory.get(MATERIAL), model.rest):
+    for inverse in (memory.get(MATERIAL_MEMORY_KEY), model.inverse_rest_deformation):
         if inverse is not None:
             a11, a12, a21, a22 = inverse.split(1, dim=-1)
             p1, p2 = a11 * p1 + a12 * p2, a21 * p1 + a22 * p2
-    return (p1, p2) if share is None else (share * p1, share * p2)
+    return (p1, p2) if area_share is None else (area_share * p1, area_share * p2)
 
 
-def inverse_growth(growths: Iterable[Tensor | None]) -> Tensor | None:
-    """A = (G1 G2 ...)^-1 [..., E or 1, 4] by rows, of growths [..., E or 1, 2, 2]; None without any.
+def inverse_rest_deformation(deformations: Iterable[Tensor | None]) -> Tensor | None:
+    """Return A = (G1 G2 ...)^-1 [..., E or 1, 4] by rows, of rest deformations [..., E or 1, 2, 2]; None without any.
 
     Raises:
         InvalidInput: no area is left.
     """
     total = None
-    for growth in growths:
-        if growth is not None:
-            total = growth if total is None else total @ growth
+    for deformation in deformations:
+        if deformation is not None:
+            total = deformation if total is None else total @ deformation
     if total is None:
         return None
     try:
@@ -67,14 +77,19 @@ def inverse_growth(growths: Iterable[Tensor | None]) -> Tensor | None:
         raise InvalidInput("rest shape", got=got, expected=expected) from error
 
 
-def grown_gradient(gradient: Tensor, rest: Tensor) -> Tensor:
-    """Gradients of the shape functions in the true rest shape, weighted so that their squares are per pattern area."""
-    inverse = rest.unflatten(-1, (2, 2))
-    return gradient @ inverse * inverse.det().rsqrt()[..., None, None]
+def rest_shape_gradient(gradient: Tensor, inverse: Tensor) -> Tensor:
+    """Return shape-function gradients in the true rest shape, weighted so that squares are per area of the pattern.
+
+    Args:
+        gradient: [E, 3, 2] 1/m, of the pattern.
+        inverse: [..., E or 1, 4], A by rows.
+    """
+    a = inverse.unflatten(-1, (2, 2))
+    return gradient @ a * a.det().rsqrt()[..., None, None]
 
 
-def _seen_from(s: Surface, inverse: Tensor) -> Surface:
-    """The surface seen from another rest shape: F -> F A with A [..., E or 1, 4] by rows."""
+def _change_rest_shape(s: Surface, inverse: Tensor) -> Surface:
+    """Return the surface as seen from another rest shape: F -> F A with A [..., E or 1, 4] by rows."""
     a11, a12, a21, a22 = inverse.split(1, dim=-1)
     f1, f2 = a11 * s.f1 + a21 * s.f2, a12 * s.f1 + a22 * s.f2
     return s._replace(f1=f1, f2=f2, cofactor1=cross(f2, s.n), cofactor2=cross(s.n, f1), J=_determinant(inverse) * s.J)

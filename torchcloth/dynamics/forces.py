@@ -1,4 +1,4 @@
-"""What acts on the vertices: forces, the air that moves along, and the boundaries."""
+"""Forces on the vertices, the added mass of air, and the boundaries."""
 
 from __future__ import annotations
 
@@ -8,18 +8,20 @@ from typing import Any, cast
 import torch
 from torch import Tensor
 
-from .._utils.linalg import cross, loaded
-from ..boundaries import AbstractCollider, Drive
+from .._utils.linalg import apply_added_mass, cross
+from ..boundaries import AbstractCollider, PrescribedMotion
 from ..effects import AbstractEffect
 from ..errors import InvalidInput
-from ..types import ClothState, Memory, Moment, Surface
-from .model import Model, assemble
+from ..types import ClothState, EffectInputs, Memory, Surface
+from .kinematics import assemble
+from .model import Model
 
-Impulses = dict[str, Tensor]  # name of a driven boundary -> [..., 6] N s, N m s: what it gave the cloth
+# name of a driven boundary -> [..., 6] N s, N m s: impulse that it gave the cloth, and its moment about the body
+Impulses = dict[str, Tensor]
 
 
-def added(total: Impulses, more: Impulses) -> Impulses:
-    """Impulses of one stretch of time and the next together."""
+def add_impulses(total: Impulses, more: Impulses) -> Impulses:
+    """Return the impulses of two consecutive spans of time together."""
     return {name: total[name] + value if name in total else value for name, value in more.items()}
 
 
@@ -28,95 +30,110 @@ def vertex_forces(
     state: ClothState,
     s: Surface,
     memory: Memory,
-    columns: tuple[Tensor, Tensor],
-    lost: Tensor | None = None,
+    stress: tuple[Tensor, Tensor],
+    compensation: Tensor | None = None,
 ) -> Tensor:
-    """Internal forces and effects, assembled on the vertices [..., V, 3] N; without what acts in stages."""
+    """Assemble internal forces and effects on the vertices, [..., V, 3] N.
+
+    Where the model has viscous stages, the viscous part of each effect is left out: ``viscous_stages`` applies it.
+
+    Args:
+        model: the model.
+        state: positions and velocities.
+        s: kinematics of the triangles.
+        memory: internal variables at this time.
+        stress: columns [..., E, 3] N/m of the first Piola-Kirchhoff stress resultant.
+        compensation: as of ``substep.step``.
+
+    Raises:
+        InvalidInput: an effect whose force has another shape than it promises, or whose viscous force acts on triangles.
+    """
     g = model.geometry
-    p1, p2 = columns
+    p1, p2 = stress
     second = -g.area * (g.warp[0] * p1 + g.weft[0] * p2)
     third = -g.area * (g.warp[1] * p1 + g.weft[1] * p2)
     first = -(second + third)
-    direct = None
+    on_vertices = None
     for name, (effect, c) in model.effects.items():
-        now = Moment(state.x, state.v, s, model.mass, memory.get(f"effects.{name}"), lost=lost)
-        force = force_of(name, effect, c, now)
+        inputs = EffectInputs(
+            state.x, state.v, s, model.mass, memory.get(f"effects.{name}"), compensation=compensation
+        )
+        force = effect_force(name, effect, c, inputs)
         if force is None:
             continue
-        later = effect.viscous(c, now) if model.stages else None
-        if later is not None and effect.acts_on == "triangles":
+        in_stages = effect.viscous(c, inputs) if model.stages else None
+        if in_stages is not None and effect.acts_on == "triangles":
             raise InvalidInput(f"effect {name!r}", got="viscous forces of triangles", expected='acts_on = "vertices"')
-        force = force if later is None else force - later
+        force = force if in_stages is None else force - in_stages
         if effect.acts_on == "triangles":
-            part = force / 3
-            first, second, third = first + part, second + part, third + part
+            share = force / 3
+            first, second, third = first + share, second + share, third + share
         else:
-            direct = force if direct is None else direct + force
+            on_vertices = force if on_vertices is None else on_vertices + force
     total = assemble(g, (first, second, third), state.x)
-    return total if direct is None else total + direct
+    return total if on_vertices is None else total + on_vertices
 
 
-def force_of(name: str, effect: AbstractEffect, c: Any, now: Moment) -> Tensor | None:
-    """What an effect gives [..., V or E, 3] N; None: nothing.
+def effect_force(name: str, effect: AbstractEffect, c: Any, inputs: EffectInputs) -> Tensor | None:
+    """Return the force of an effect, [..., V or E, 3] N, or None where it has none.
 
     Raises:
-        InvalidInput: another shape than it promised.
+        InvalidInput: another shape than the effect promises.
     """
-    force = effect.force(c, now)
-    rows = (now.x if effect.acts_on == "vertices" else now.surface.n).shape[-2]
+    force = effect.force(c, inputs)
+    rows = (inputs.x if effect.acts_on == "vertices" else inputs.surface.n).shape[-2]
     if force is not None and force.shape[-2:] != (rows, 3):
         expected = f"[..., {rows}, 3], a row for each of the {effect.acts_on}"
         raise InvalidInput(f"force of effect {name!r}", got=f"shape {tuple(force.shape)}", expected=expected)
     return force
 
 
-def resistance_of(model: Model, s: Surface, x: Tensor) -> Tensor | None:
-    """Mass that moves along with the normal only, relative to the vertices' own [..., V, 3, 3]; None without any."""
-    found = [effect.inertia(c, s) for effect, c in model.effects.values()]
-    triangles = [m for m in found if m is not None]
-    if not triangles:
+def compute_added_mass_ratio(model: Model, s: Surface, x: Tensor) -> Tensor | None:
+    """Compute B = sum m_air (n (x) n) / m_vertex, [..., V, 3, 3]; None without any added mass.
+
+    The air has inertia along the triangles' normals only, so 1 + B is the mass matrix of a vertex over its own mass.
+    """
+    inertias = [effect.inertia(c, s) for effect, c in model.effects.values()]
+    per_triangle = [inertia for inertia in inertias if inertia is not None]
+    if not per_triangle:
         return None
-    share = (sum(triangles) / 3 * s.n).unsqueeze(-1) * s.n.unsqueeze(-2)
+    share = (sum(per_triangle) / 3 * s.n).unsqueeze(-1) * s.n.unsqueeze(-2)
     flat = share.flatten(-2)
     total = assemble(model.geometry, (flat, flat, flat), x[..., :1].expand(*x.shape[:-1], 9))
     return (total / model.mass).unflatten(-1, (3, 3))
 
 
-def constrain(
+def apply_boundaries(
     model: Model,
     x: Tensor,
     v: Tensor,
     dt: float,
-    drives: Mapping[str, Drive],
+    prescribed: Mapping[str, PrescribedMotion],
     substep: int,
-    resistance: Tensor | None,
+    added_mass_ratio: Tensor | None,
 ) -> tuple[Tensor, Impulses]:
-    """Velocities that obey the boundaries, and what each driven one gave: impulse and its moment about the body."""
+    """Change velocities [..., V, 3] m/s so that they obey all boundaries, and record what each driven one gave.
+
+    Returns:
+        The new velocities; and by boundary the impulse on the cloth and on the air that moves along [N s], with its
+        moment [N m s] about the body's origin at the start of the substep. With the positions of that time, angular
+        momentum balances.
+    """
     impulses: Impulses = {}
     for name, boundary in model.boundaries.items():
-        drive = drives.get(name)
+        motion = prescribed.get(name)
         if isinstance(boundary, AbstractCollider):
-            after = boundary.constrain(x, v, dt, drive, substep, resistance, model.mass)
+            after = boundary.constrain(x, v, dt, motion, substep, added_mass_ratio, model.mass)
         else:
-            after = boundary.constrain(x, v, dt, drive, substep)
-        if drive is not None:
-            after = _slipped(model, name, v, after, dt, resistance)
-            momentum = model.mass * loaded(resistance, after - v)
-            arm = x - _origin(drive, substep)
-            impulses[name] = torch.cat([momentum.sum(-2), cross(arm, momentum).sum(-2)], dim=-1)
+            after = boundary.constrain(x, v, dt, motion, substep)
+        if motion is not None:
+            for effect, c in model.effects.values():
+                if effect.grasp == name:
+                    index = cast("Tensor", model.boundaries[name].index)
+                    after = effect.grip_velocities(c, index, v, after, model.mass, dt, added_mass_ratio)
+            momentum = model.mass * apply_added_mass(added_mass_ratio, after - v)
+            increment, end = motion.increment[..., substep, :, :], motion.pose[..., substep, None, :3, 3]
+            origin = (end - increment[..., None, :3, 3]) @ increment[..., :3, :3]
+            impulses[name] = torch.cat([momentum.sum(-2), cross(x - origin, momentum).sum(-2)], dim=-1)
         v = after
     return v, impulses
-
-
-def _origin(drive: Drive, substep: int) -> Tensor:
-    """Where the body's origin is at the start of the substep [..., 1, 3] m; with x there, angular momentum balances."""
-    step, end = drive.increment[..., substep, :, :], drive.pose[..., substep, None, :3, 3]
-    return (end - step[..., None, :3, 3]) @ step[..., :3, :3]
-
-
-def _slipped(model: Model, grasp: str, free: Tensor, held: Tensor, dt: float, resistance: Tensor | None) -> Tensor:
-    for effect, c in model.effects.values():
-        if effect.grasp == grasp:
-            index = cast("Tensor", model.boundaries[grasp].index)
-            held = effect.loosen(c, index, free, held, model.mass, dt, resistance)
-    return held

@@ -1,4 +1,4 @@
-"""The largest step that explicit integration survives."""
+"""The longest substep for which explicit integration is stable."""
 
 from __future__ import annotations
 
@@ -7,118 +7,143 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from .._utils.caching import Remembered
+from .._utils.caching import VersionedTensorCache
 from ..errors import InvalidInput, UnstableStep
 from ..materials import Stiffness
-from .elasticity import grown_gradient
+from .elasticity import rest_shape_gradient
 from .model import Model
-from .viscous_stages import MOST, Polynomial
+from .viscous_stages import MAX_STAGES, StagePolynomial
 
-SAFETY = 0.7  # of the linear limit: leaves room for tangents that double beyond what the material states
-LOOSE = 4.0  # speed that a grip yields for a viscous force over the one that causes it: stages hold what is held
-STAGE = 0.4  # of a substep's cost, for a stage: 0.3 of bending, 0.45 of the membrane
+# Substep over the linear stability limit. It leaves room for tangents that double beyond what the material states.
+STEP_SAFETY_FACTOR = 0.7
+# Largest speed with which a grip yields to a viscous force, over the speed that causes the force. Beyond it viscous
+# forces act in one piece: stages treat gripped vertices as prescribed.
+MAX_GRIP_SPEED_RATIO = 4.0
+STAGE_COST_IN_SUBSTEPS = 0.4  # measured: 0.3 for bending, 0.45 for the membrane
 
 
-class Limits(NamedTuple):
-    """What bounds a substep of the symplectic Euler scheme."""
+class StabilityLimits(NamedTuple):
+    """Bounds on the substep of the symplectic Euler scheme.
 
-    squared: float  # 1/s^2, of the highest frequency omega
-    damping: float  # 1/s, linear damping rate of what acts in one piece
-    viscous: float  # 1/s, of what may act in stages, see relaxation.py
+    Attributes:
+        squared_frequency: omega^2 [1/s^2] of the highest frequency.
+        damping_rate: [1/s], linear damping that acts in one piece.
+        viscous_rate: [1/s], linear damping that may act in stages (``viscous_stages``).
+    """
 
-    def longest(self, stages: int) -> float:
-        """Stable substep [s]: SAFETY x 2 / omega, less where there is damping."""
+    squared_frequency: float
+    damping_rate: float
+    viscous_rate: float
+
+    def stable_step(self, stages: int) -> float:
+        """Return the stable substep [s] with so many stages: STEP_SAFETY_FACTOR x 2 / omega, less with damping."""
         if stages == 0:
-            return self._explicit(4, self.damping + self.viscous)
-        reach = SAFETY * Polynomial.of(stages).reach / self.viscous
-        return min(self._explicit(2, self.damping), reach)
+            return self._explicit_step(4, self.damping_rate + self.viscous_rate)
+        limit = STEP_SAFETY_FACTOR * StagePolynomial.for_stages(stages).largest_rate / self.viscous_rate
+        return min(self._explicit_step(2, self.damping_rate), limit)
 
-    def _explicit(self, room: float, c: float) -> float:
-        """SAFETY times the step for which room - 2 c dt - omega^2 dt^2 = 0."""
-        return SAFETY * ((c**2 + room * self.squared) ** 0.5 - c) / self.squared
+    def _explicit_step(self, room: float, c: float) -> float:
+        """Return STEP_SAFETY_FACTOR times the dt for which room - 2 c dt - omega^2 dt^2 = 0."""
+        return STEP_SAFETY_FACTOR * ((c**2 + room * self.squared_frequency) ** 0.5 - c) / self.squared_frequency
 
     @property
-    def step(self) -> float:
-        """The stable substep [s] with which a simulation costs least."""
-        return max((self.longest(n) / (1 + STAGE * n), self.longest(n)) for n in self._stages())[1]
+    def cheapest_step(self) -> float:
+        """Stable substep [s] with which a simulation costs least."""
+        steps = ((self.stable_step(n), 1 + STAGE_COST_IN_SUBSTEPS * n) for n in self._allowed_stages())
+        return max((step / cost, step) for step, cost in steps)[1]
 
-    def stages(self, dt: float) -> int:
-        """Fewest for ``dt`` [s], of at most ``step``; 0 for a step that overflowed.
+    def stages_for(self, dt: float) -> int:
+        """Return the smallest number of stages for a substep ``dt`` [s] of at most ``cheapest_step``.
 
-        Who shortens the step wants room, for rates that stretching raises: their square grows as the step shrinks.
+        Who shortens the step wants room for rates that stretching raises. So the square of the room grows as the step
+        shrinks. A step that overflowed gets 0.
         """
-        return next((n for n in self._stages() if (dt * self.step) ** 0.5 <= self.longest(n) * (1 + 1e-9)), 0)
+        wanted = (dt * self.cheapest_step) ** 0.5
+        return next((n for n in self._allowed_stages() if wanted <= self.stable_step(n) * (1 + 1e-9)), 0)
 
-    def _stages(self) -> list[int]:
-        return [0, *range(2, MOST + 1)] if self.viscous > 0 else [0]
+    def _allowed_stages(self) -> list[int]:
+        return [0, *range(2, MAX_STAGES + 1)] if self.viscous_rate > 0 else [0]
 
 
 def check_precision(dtype: torch.dtype) -> None:
-    """Refuse one in which a substep is lost in rounding."""
+    """Refuse a floating-point type in which a substep vanishes in rounding.
+
+    Raises:
+        InvalidInput: neither float32 nor float64.
+    """
     if dtype not in (torch.float32, torch.float64):
         got = str(dtype).removeprefix("torch.")
         raise InvalidInput("precision of the cloth", got=got, expected="float32 or float64", remedy="use cloth.float()")
 
 
 @torch.no_grad()
-def limits_of(model: Model, gradient: Tensor, inelastic: Tensor | None = None) -> Limits:
-    """Those of a cloth with all its parts; ``gradient``: of the shape functions of the pattern.
+def stability_limits(model: Model, gradient: Tensor, inverse_plastic: Tensor | None = None) -> StabilityLimits:
+    """Compute the stability limits of a cloth with all its parts.
 
-    ``inelastic``: what has set [..., E, 4], A by rows: triangles that are crushed are small, and their step is short.
-    What was found last for a mesh is remembered, with all numbers that it hangs on.
+    The frequency of the mesh is cached per mesh, with all numbers that it depends on.
+
+    Args:
+        model: the parts.
+        gradient: [E, 3, 2] 1/m, gradients of the shape functions of the pattern.
+        inverse_plastic: [..., E, 4], inverse of the plastic set by rows. Triangles that are crushed are small, and
+            their step is short.
 
     Raises:
-        InvalidInput: a precision in which a substep is lost in rounding.
+        InvalidInput: a precision in which a substep vanishes in rounding, or a vertex without mass.
         UnstableStep: stiffnesses that overflow.
     """
     check_precision(gradient.dtype)
     spacing = None if model.grid is None else model.grid.spacing
-    extra = [effect.rates(c, model.mass) for effect, c in model.effects.values()]
-    elastic, damping = (sum(float(rate[i]) for rate in extra) for i in (0, 1))
-    staged = model.effects.values() if model.custom_substep is None else ()
-    viscous = sum(float(effect.viscous_rate(c, model.mass)) for effect, c in staged)
-    yielding = max((effect.grip_compliance(c) for effect, c in model.effects.values()), default=0.0)
-    if viscous > 0 and yielding * viscous * float(model.mass.detach().max()) > LOOSE:
+    bounds = [effect.stability_bounds(c, model.mass) for effect, c in model.effects.values()]
+    from_effects, damping = (sum(float(bound[i]) for bound in bounds) for i in (0, 1))
+    in_stages = model.effects.values() if model.custom_substep is None else ()
+    viscous = sum(float(effect.viscous_stability_bound(c, model.mass)) for effect, c in in_stages)
+    compliance = max((effect.grip_compliance(c) for effect, c in model.effects.values()), default=0.0)
+    if viscous > 0 and compliance * viscous * float(model.mass.detach().max()) > MAX_GRIP_SPEED_RATIO:
         viscous = 0.0
-    lighter = _lighter(model)
+    mass_ratio = _largest_mass_ratio(model)
     stiffness = Stiffness(*(t.to(gradient) for t in model.material.stiffness(model.coefficients)))  # may be float64
-    numbers = (*stiffness, model.areal_density, *([] if model.rest is None else [model.rest]))
-    beside = (spacing, *((t.dtype, t.detach().tolist()) for t in numbers))
+    inverse_rest = model.inverse_rest_deformation
+    numbers = (*stiffness, model.areal_density, *([] if inverse_rest is None else [inverse_rest]))
+    dependencies = (spacing, *((t.dtype, t.detach().tolist()) for t in numbers))
 
-    def find() -> float:
-        shape = gradient if model.rest is None else grown_gradient(gradient, model.rest)
-        shape = shape if inelastic is None else shape @ inelastic.unflatten(-1, (2, 2))
+    def compute() -> float:
+        shape = gradient if inverse_rest is None else rest_shape_gradient(gradient, inverse_rest)
+        shape = shape if inverse_plastic is None else shape @ inverse_plastic.unflatten(-1, (2, 2))
         try:
-            return squared_frequency(shape, model.areal_density, stiffness, spacing)
+            return bound_squared_frequency(shape, model.areal_density, stiffness, spacing)
         except torch.linalg.LinAlgError as error:  # pyright: ignore[reportPrivateImportUsage] - not finite, or its square
             largest = max(float(t.max()) for t in stiffness)
             raise UnstableStep("stiffness", got=f"{largest:.3g} N/m", expected="a fabric's: the step is 0 s") from error
 
-    squared = _KNOWN.of(gradient, find, beside) if inelastic is None else find()
-    return Limits(lighter * squared + elastic, max(0.0, damping - viscous), viscous)
+    if inverse_plastic is None:
+        squared = _MESH_FREQUENCIES.get_or_compute(gradient, compute, dependencies)
+    else:
+        squared = compute()
+    return StabilityLimits(mass_ratio * squared + from_effects, max(0.0, damping - viscous), viscous)
 
 
-def _lighter(model: Model) -> float:
-    """Largest ratio of the fabric's own mass at a vertex to the one that it has; 1 where nothing takes mass away."""
+def _largest_mass_ratio(model: Model) -> float:
+    """Return the largest ratio of the fabric's own mass at a vertex to its mass; 1 if no effect takes mass away."""
     mass = model.mass.detach()
     if not bool((mass > 0).all()):
         raise InvalidInput(
             "mass", got=f"{float(mass.min()):.3g} kg at a vertex", expected="more than 0 with all effects"
         )
-    added = [own for effect, c in model.effects.values() if (own := effect.mass(c)) is not None]
+    added = [extra for effect, c in model.effects.values() if (extra := effect.mass(c)) is not None]
     return float((1 - sum(added) / mass).clamp(min=1.0).max()) if added else 1.0
 
 
-_KNOWN: Remembered[float] = Remembered()  # by the gradient, which belongs to one mesh
+_MESH_FREQUENCIES: VersionedTensorCache[float] = VersionedTensorCache()  # by the gradient, which belongs to one mesh
 
 
-def squared_frequency(gradient: Tensor, density: Tensor, stiffness: Stiffness, spacing: float | None) -> float:
-    """Bound on omega^2 [1/s^2] of the mesh and its directors.
+def bound_squared_frequency(gradient: Tensor, density: Tensor, stiffness: Stiffness, spacing: float | None) -> float:
+    """Compute a bound on omega^2 [1/s^2] of the mesh and its directors.
 
     The highest frequency of the mesh is bounded by that of its stiffest free element with lumped mass
-    (Irons and Treharne 1971). The director adds its own: a contact point alone in its grid cell sees
-    sum_i |dw_i|^2 / w_i, 4 / spacing^2 at a node and 6 between two, of which 4 are counted (contact was met with at
-    most a quarter of them); its shear reacts on the triangle's out-of-plane motion.
+    (Irons and Treharne 1971). The director adds its own. A contact point alone in its grid cell sees
+    sum_i |dw_i|^2 / w_i, which is 4 / spacing^2 at a node and 6 between two. Of these 4 are counted: contact was met
+    with at most a quarter of them. The director's shear reacts on the out-of-plane motion of the triangle.
 
     Args:
         gradient: [E, 3, 2] 1/m, gradients of the shape functions.
@@ -130,7 +155,7 @@ def squared_frequency(gradient: Tensor, density: Tensor, stiffness: Stiffness, s
     zero = torch.zeros_like(gx)
     strain = torch.stack([torch.cat([gx, zero], -1), torch.cat([zero, gy], -1), torch.cat([gy, gx], -1)], dim=-2)
     gram = strain @ strain.mT  # [E, 3, 3], the non-zero spectrum of B^T B
-    root = _root(stiffness)
+    root = _matrix_root(stiffness)
     membrane = torch.linalg.eigvalsh(root.mT @ gram @ root)[..., -1:]
     steepest = torch.linalg.eigvalsh(gradient.mT @ gradient)[..., -1:]
     squared = 3 * membrane / density
@@ -140,10 +165,10 @@ def squared_frequency(gradient: Tensor, density: Tensor, stiffness: Stiffness, s
     return float(squared.detach().max())
 
 
-def _root(stiffness: Stiffness) -> Tensor:
-    """Square root of the plane elasticity matrix [..., 3, 3] in engineering strains.
+def _matrix_root(stiffness: Stiffness) -> Tensor:
+    """Return the square root of the plane elasticity matrix, [..., 3, 3], in engineering strains.
 
-    Of a positive 2 x 2 matrix M it is (M + d 1) / sqrt(tr M + 2 d), d = sqrt(det M).
+    For a positive 2 x 2 matrix M it is (M + d 1) / sqrt(tr M + 2 d), d = sqrt(det M).
     """
     warp, weft, coupling, shear = torch.broadcast_tensors(*stiffness[:4])
     d = (warp * weft - coupling * coupling).sqrt()

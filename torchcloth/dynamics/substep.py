@@ -1,9 +1,20 @@
 """The algorithm on one page. Read this file first.
 
-One substep: internal variables -> forces on the mesh, stiff viscous ones in stages -> velocities -> contact through the
-grid -> boundaries -> positions -> directors. Elasticity and effects act on the vertices, which carry all the mass; the
-grid carries only contact. That split is what makes the solution converge when the step is halved: forces that pass
-through the grid are filtered at every step.
+``step`` advances the cloth by one substep, in this order:
+
+1. kinematics of the triangles (``kinematics.surface``);
+2. internal variables: plastic set, internal friction, creases (``elasticity.update_memory``);
+3. membrane stress, and the reaction of compressed directors (``elasticity.membrane_stress``,
+   ``contact.self_contact.compute_director_forces``);
+4. forces on the vertices (``forces.vertex_forces``), stiff viscous ones in stages
+   (``viscous_stages.apply_viscous_stages``);
+5. velocities free of boundaries, with the contact between layers through the grid
+   (``contact.self_contact.contact_velocity_change``);
+6. boundaries: grasps and colliders, in order (``forces.apply_boundaries``);
+7. positions, and the directors that they carry along (``contact.self_contact.advance_directors``).
+
+Elasticity and effects act on the vertices, which carry all the mass; the grid carries only contact. That split makes
+the solution converge when the step is halved: forces that pass through the grid are filtered at every step.
 """
 
 from __future__ import annotations
@@ -13,119 +24,152 @@ from collections.abc import Mapping
 import torch
 from torch import Tensor
 
-from .._utils.linalg import dot, resisted
-from ..boundaries import Drive
+from .._utils.linalg import dot, solve_added_mass
+from ..boundaries import PrescribedMotion
 from ..types import ClothState
-from .contact.self_contact import Layers, add_columns, director_energy, follow, near_layers, pressure, repulsion
-from .elasticity import elastic, evolve, membrane_stress
-from .forces import Impulses, added, constrain, resistance_of, vertex_forces
-from .model import Geometry, Model, surface
-from .viscous_stages import relaxed
-
-__all__ = ["Geometry", "Impulses", "Model", "energy", "rollout", "step", "surface"]
+from .contact.self_contact import (
+    ContactCandidates,
+    add_director_stress,
+    advance_directors,
+    compute_director_forces,
+    contact_velocity_change,
+    director_energy,
+    find_contact_candidates,
+)
+from .elasticity import elastic_deformation, membrane_stress, update_memory
+from .forces import Impulses, add_impulses, apply_boundaries, compute_added_mass_ratio, vertex_forces
+from .kinematics import surface
+from .model import Model
+from .viscous_stages import apply_viscous_stages
 
 
 def step(
     model: Model,
     state: ClothState,
     dt: float,
-    drives: Mapping[str, Drive],
+    prescribed: Mapping[str, PrescribedMotion],
     substep: int,
-    layers: Layers | None = None,
+    contact_candidates: ContactCandidates | None = None,
     compensation: Tensor | None = None,
 ) -> tuple[ClothState, Impulses]:
-    """Advance one substep (symplectic Euler).
+    """Advance the cloth by one substep of symplectic Euler.
 
-    ``layers``: of this state or one nearby, None: to be found. ``lost``: see ``stretch``.
+    Args:
+        model: mesh constants and parts, with all parameters resolved to tensors.
+        state: positions, velocities and internal variables at the start of the substep.
+        dt: length of the substep [s].
+        prescribed: motion of the driven boundaries by name, one row per substep.
+        substep: row of ``prescribed`` to use.
+        contact_candidates: triangles that may touch another layer, from this or a nearby state; searched for if None.
+        compensation: [..., V, 3] m, rounding error of ``state.x`` that was carried over (Kahan summation, float32 only).
+
+    Returns:
+        The state at the end of the substep, and the impulse [N s, N m s] that each driven boundary gave the cloth.
     """
     s = surface(model.geometry, state.x, state.v, compensation)
-    memory = evolve(model, state, s, dt, compensation)
-    columns = membrane_stress(model, s, memory)
-    grid, press = model.grid, None
+    memory = update_memory(model, state, s, dt, compensation)
+    stress = membrane_stress(model, s, memory)
+    grid, directors = model.grid, None
     if grid is not None:
-        layers = near_layers(model, grid, state.x) if layers is None else layers
-        if len(layers.active):
-            press = pressure(model, grid, layers, state, s, dt)
-            columns = add_columns(layers, columns, press)
+        if contact_candidates is None:
+            contact_candidates = find_contact_candidates(model, grid, state.x)
+        if len(contact_candidates.active):
+            directors = compute_director_forces(model, grid, contact_candidates, state, s, dt)
+            stress = add_director_stress(contact_candidates, stress, directors)
 
-    resistance = resistance_of(model, s, state.x)
-    force = vertex_forces(model, state, s, memory, columns, compensation)
-    v = relaxed(model, state, s, memory, dt, drives, substep, resistance)
-    free = v + dt * resisted(resistance, force / model.mass)
-    if grid is not None and layers is not None and press is not None:
-        free = free + resisted(resistance, repulsion(model, grid, layers, press, s, free, dt))
-    v, impulses = constrain(model, state.x, free, dt, drives, substep, resistance)
+    added_mass_ratio = compute_added_mass_ratio(model, s, state.x)
+    force = vertex_forces(model, state, s, memory, stress, compensation)
+    v = apply_viscous_stages(model, state, s, memory, dt, prescribed, substep, added_mass_ratio)
+    free = v + dt * solve_added_mass(added_mass_ratio, force / model.mass)  # velocity free of contact and boundaries
+    if grid is not None and contact_candidates is not None and directors is not None:
+        change = contact_velocity_change(model, grid, contact_candidates, directors, s, free, dt)
+        free = free + solve_added_mass(added_mass_ratio, change)
+    v, impulses = apply_boundaries(model, state.x, free, dt, prescribed, substep, added_mass_ratio)
 
     x, d3 = state.x + dt * v, state.d3
-    if grid is not None and layers is not None:
-        d3, memory["contact"] = follow(model, grid, layers, press, s, v, surface(model.geometry, x, v), dt)
+    if grid is not None and contact_candidates is not None:
+        after = surface(model.geometry, x, v)
+        d3, memory["contact"] = advance_directors(model, grid, contact_candidates, directors, s, v, after, dt)
     return ClothState(x, v, d3, memory), impulses
 
 
-def rollout(model: Model, state: ClothState, dt: float, drives: Mapping[str, Drive], substeps: int, first: int = 0):
-    """``substeps`` substeps from index ``first`` of the drives; impulses are summed."""
-    state, _, total = stretch(model, state, None, dt, drives, substeps, first)
+def rollout(
+    model: Model,
+    state: ClothState,
+    dt: float,
+    prescribed: Mapping[str, PrescribedMotion],
+    substeps: int,
+    first: int = 0,
+) -> tuple[ClothState, Impulses]:
+    """Advance the cloth by ``substeps`` substeps, from row ``first`` of the prescribed motion on.
+
+    Returns:
+        The last state, and the impulses summed over all substeps.
+    """
+    state, _, total = rollout_segment(model, state, None, dt, prescribed, substeps, first)
     return state, total
 
 
-def stretch(
+def rollout_segment(
     model: Model,
     state: ClothState,
-    lost: Tensor | None,
+    compensation: Tensor | None,
     dt: float,
-    drives: Mapping[str, Drive],
+    prescribed: Mapping[str, PrescribedMotion],
     substeps: int,
     first: int = 0,
 ) -> tuple[ClothState, Tensor | None, Impulses]:
-    """As ``rollout``; ``lost`` goes from one stretch to the next: see ``_kept``."""
+    """Advance as ``rollout`` does, with the rounding error that passes from one segment to the next."""
     total: Impulses = {}
-    layers = None
+    candidates = None
     for k in range(first, first + substeps):
         if model.grid is not None:
-            layers = near_layers(model, model.grid, state.x, layers)
-        state, lost, impulses = substep(model, state, lost, dt, drives, k, layers)
-        total = added(total, impulses)
-    return state, lost, total
+            candidates = find_contact_candidates(model, model.grid, state.x, candidates)
+        state, compensation, impulses = compensated_step(model, state, compensation, dt, prescribed, k, candidates)
+        total = add_impulses(total, impulses)
+    return state, compensation, total
 
 
-def substep(
+def compensated_step(
     model: Model,
     state: ClothState,
-    lost: Tensor | None,
+    compensation: Tensor | None,
     dt: float,
-    drives: Mapping[str, Drive],
+    prescribed: Mapping[str, PrescribedMotion],
     k: int,
-    layers: Layers | None,
+    contact_candidates: ContactCandidates | None,
 ) -> tuple[ClothState, Tensor | None, Impulses]:
-    """As ``step``, or the model's custom substep, with what the substep before has ``lost``."""
+    """Advance by ``step``, or by the model's custom substep; in float32, carry the rounding error of positions over."""
     before, advance = state.x, step if model.custom_substep is None else model.custom_substep.advance
-    state, impulses = advance(model, state, dt, drives, k, layers, lost)
+    state, impulses = advance(model, state, dt, prescribed, k, contact_candidates, compensation)
     if state.x.dtype == torch.float32:
-        state, lost = _kept(before, state, lost, dt)
-    return state, lost, impulses
+        state, compensation = compensated_add(before, state, compensation, dt)
+    return state, compensation, impulses
 
 
-def _kept(before: Tensor, state: ClothState, lost: Tensor | None, dt: float) -> tuple[ClothState, Tensor]:
-    """Add to the positions what was too small to be added before; what is too small now (Kahan 1965).
+def compensated_add(
+    before: Tensor, state: ClothState, compensation: Tensor | None, dt: float
+) -> tuple[ClothState, Tensor]:
+    """Add to the positions what earlier sums rounded away, and return what this sum rounds away (Kahan 1965).
 
-    Substeps are short: at 1 mm/s they are one or two units in the last place of float32, and what is rounded alike in
-    all of them would let slow grippers move cloth twice as far, or not at all.
+    Substeps are short: at 1 mm/s they are one or two units in the last place of float32. The rounding would be the same
+    in all of them, and slow grippers would move cloth twice as far, or not at all.
     """
     missing = (dt * state.v - (state.x - before)).detach()
-    missing = missing if lost is None else lost + missing
+    missing = missing if compensation is None else compensation + missing
     x = state.x + missing
     return state._replace(x=x), missing - (x - state.x).detach()
 
 
 def energy(model: Model, state: ClothState) -> dict[str, Tensor]:
-    """Energies [...] J: kinetic, membrane, director."""
+    """Compute the energies [...] J by name: kinetic, membrane, and director where there is contact."""
     s = surface(model.geometry, state.x, state.v)
-    strained, share = elastic(model, s, state.memory)
+    strained, area_share = elastic_deformation(model, s, state.memory)
     density = model.material.membrane_energy(model.coefficients, strained)
-    out = {
+    energies = {
         "kinetic": 0.5 * (model.mass * dot(state.v, state.v)).sum((-2, -1)),
-        "membrane": (s.area * (density if share is None else share * density)).sum((-2, -1)),
+        "membrane": (s.area * (density if area_share is None else area_share * density)).sum((-2, -1)),
     }
     if model.grid is not None:
-        out["director"] = director_energy(model, model.grid, s, state.d3)
-    return out
+        energies["director"] = director_energy(model, model.grid, s, state.d3)
+    return energies

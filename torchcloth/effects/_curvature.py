@@ -10,20 +10,20 @@ import numpy as np
 
 from ..meshes import Mesh
 
-GROWTHS = 3  # rings of triangles that may be added to a vertex's own
-DETERMINED = 0.15  # smallest over largest singular value of a fit that needs no more neighbours
+MAX_RING_GROWTHS = 3  # rings of triangles that may be added to a vertex's own
+MIN_SINGULAR_VALUE_RATIO = 0.15  # smallest over largest singular value of a fit that needs no more neighbours
 
 
-class Stencils(NamedTuple):
+class CurvatureStencils(NamedTuple):
     """Derivatives of a field f at every vertex v: sum_n weight_n (f_n - f_v). Rows are padded with v, weight 0."""
 
-    near: np.ndarray  # [V, N] int
+    neighbours: np.ndarray  # [V, N] int
     second: np.ndarray  # [V, N, 3] 1/m^2, along ww, ff, and sqrt 2 times wf
     first: np.ndarray  # [V, N, 2] 1/m, along w, f
 
 
 @lru_cache(maxsize=8)  # of the last meshes: variants of a model share theirs
-def curvature_stencils(mesh: Mesh) -> Stencils:
+def curvature_stencils(mesh: Mesh) -> CurvatureStencils:
     """First and second derivatives at every vertex; not to be written to.
 
     They come from a least-squares quadratic through the
@@ -41,7 +41,7 @@ def curvature_stencils(mesh: Mesh) -> Stencils:
     weight = np.zeros((len(rows), depth, 5))
     for v, (near, w) in enumerate(rows):
         stencil[v, : len(near)], weight[v, : len(near)] = near, w
-    return Stencils(stencil, weight[..., :3], weight[..., 3:])
+    return CurvatureStencils(stencil, weight[..., :3], weight[..., 3:])
 
 
 def mixed_area(mesh: Mesh) -> np.ndarray:
@@ -62,14 +62,14 @@ def mixed_area(mesh: Mesh) -> np.ndarray:
     return area
 
 
-class Pattern(NamedTuple):
+class SparsityPattern(NamedTuple):
     """Where a matrix that couples the vertices of each stencil is not zero, by rows."""
 
     columns: np.ndarray  # [V, D] int, padded with the row itself
     slots: np.ndarray  # [V, N + 1, N + 1] int, place of each stencil's local entry in the flat columns; V D for none
 
 
-def pattern(near: np.ndarray, local: np.ndarray) -> Pattern:
+def find_sparsity_pattern(near: np.ndarray, local: np.ndarray) -> SparsityPattern:
     """Entries that are not negligible where local matrices [V, N + 1, N + 1] (the vertex first) are summed.
 
     The diagonal is left out: rows sum to zero, so (Q f)_i = sum_d entry_id (f_d - f_i).
@@ -87,10 +87,10 @@ def pattern(near: np.ndarray, local: np.ndarray) -> Pattern:
     columns[row[kept], place] = column[kept]
     slot = np.full(len(key), columns.size)
     slot[kept] = row[kept] * columns.shape[1] + place
-    return Pattern(columns, slot[inverse.ravel()].reshape(local.shape))
+    return SparsityPattern(columns, slot[inverse.ravel()].reshape(local.shape))
 
 
-def gathered(shape: Pattern, local: np.ndarray) -> np.ndarray:
+def sum_entries(shape: SparsityPattern, local: np.ndarray) -> np.ndarray:
     """Off-diagonal entries [V, D] of the sum of the local matrices."""
     flat = np.bincount(shape.slots.ravel(), weights=local.ravel(), minlength=shape.columns.size + 1)
     return flat[:-1].reshape(shape.columns.shape)
@@ -179,9 +179,9 @@ def _determined(v: int, spokes: dict[int, complex], beyond) -> dict[int, complex
     """Unfolded neighbours of ``v``, enough for a quadratic if the mesh has them."""
     place = _ring(v, spokes, beyond)
     edges = [(a, beyond[v, a][0]) for a in place if (v, a) in beyond]
-    for _ in range(GROWTHS):
+    for _ in range(MAX_RING_GROWTHS):
         singular = np.linalg.svd(_design(np.array(list(place.values())))[0], compute_uv=False)
-        if len(singular) == 3 and singular[2] > DETERMINED * singular[0]:
+        if len(singular) == 3 and singular[2] > MIN_SINGULAR_VALUE_RATIO * singular[0]:
             break
         edges, place = _grown(edges, {v: 0j, **place}, beyond)
         del place[v]
@@ -226,7 +226,7 @@ def _fit(patch: dict[int, complex]) -> tuple[list[int], np.ndarray]:
     """Neighbours and their weights [N, 5]: second derivatives, first derivatives."""
     root, slope, quadratic, project, length = _split(np.array(list(patch.values())))
     left, singular, right = np.linalg.svd(project @ quadratic, full_matrices=False)
-    kept = singular > DETERMINED / 20 * len(patch) ** 0.5  # before the linear part went, every row had length 1/2
+    kept = singular > MIN_SINGULAR_VALUE_RATIO / 20 * len(patch) ** 0.5  # before the linear part went, every row had length 1/2
     inverse = np.where(kept, 1 / np.where(kept, singular, 1.0), 0.0)
     second = (right.T * inverse) @ left.T @ project
     first = slope @ root @ (np.eye(len(patch)) - quadratic @ second)

@@ -11,7 +11,7 @@ from .._utils.linalg import safe_norm
 from ..errors import InvalidInput
 
 
-def dragged(share: Tensor, change: Tensor, threshold: float) -> Tensor:
+def update_dahl_fraction(share: Tensor, change: Tensor, threshold: float) -> Tensor:
     """Share z / Z [..., K] of the sliding friction after the strain has gone straight by ``change`` [..., K].
 
     Exact, so it depends on the path and not on steps or time. Friction opposes motion as a vector: where K > 1 its

@@ -9,9 +9,9 @@ import torch
 from torch import Tensor, nn
 
 from .._utils.linalg import dot
-from ._curvature import Stencils, local_matrices, pattern
+from ._curvature import CurvatureStencils, local_matrices, find_sparsity_pattern
 
-PARTS = ((0, 0), (1, 1), (0, 1), (2, 2))  # entries of P that do not vanish, in the order of ``Plate``
+PLATE_ENTRIES = ((0, 0), (1, 1), (0, 1), (2, 2))  # entries of P that do not vanish, in the order of ``Plate``
 
 
 class Plate(NamedTuple):
@@ -33,13 +33,13 @@ class Plate(NamedTuple):
         direct = self.warp * dot(ww, ww) + 2 * self.cross * dot(ww, ff) + self.weft * dot(ff, ff)
         return 0.5 * (direct + self.twist * dot(wf, wf))
 
-    def largest(self) -> Tensor:
+    def eigenvalue_bound(self) -> Tensor:
         """Bound [] N m on P's eigenvalues."""
         direct = torch.maximum(self.warp, self.weft) + self.cross.abs()
         return torch.maximum(direct, self.twist).amax()
 
 
-class Operator(nn.Module):
+class PlateOperator(nn.Module):
     """Q of F = -Q x for any plate: entries are summed once per rollout, so a substep costs what it does without."""
 
     def __init__(self) -> None:
@@ -50,11 +50,11 @@ class Operator(nn.Module):
         self.slots: Tensor  # [V, M] place of a stencil's local entries in the flat result; D V for none
         self.locals: Tensor  # [4, V, M] 1/m^2, of a unit of each of a plate's coefficients, sign reversed
 
-    def bind(self, stencils: Stencils, area: np.ndarray, device: torch.device | None = None) -> Operator:
+    def bind(self, stencils: CurvatureStencils, area: np.ndarray, device: torch.device | None = None) -> PlateOperator:
         """Local matrices of every vertex's stencil."""
         form = stencils.second * np.sqrt(area)[:, None, None]
-        parts = [_symmetric(form, i, j) for i, j in PARTS]
-        shape = pattern(stencils.near, np.abs(parts).sum(0))
+        parts = [_symmetric(form, i, j) for i, j in PLATE_ENTRIES]
+        shape = find_sparsity_pattern(stencils.neighbours, np.abs(parts).sum(0))
         count, depth = shape.columns.shape
         turned = shape.slots % depth * count + shape.slots // depth  # of the transposed table
         turned = np.where(shape.slots == count * depth, count * depth, turned)

@@ -38,19 +38,19 @@ class Triangles(nn.Module):
         first, second, third = x.index_select(-2, self.corners).unflatten(-2, (3, -1)).unbind(-3)
         return first, second, third
 
-    def summed(self, corners: Sequence[Tensor]) -> Tensor:
+    def sum_on_vertices(self, corners: Sequence[Tensor]) -> Tensor:
         """Sums [..., V, 3] of values [..., E, 3] at the three corners."""
         values = torch.cat(list(corners), dim=-2)
         zero = values.new_zeros(*values.shape[:-2], len(self.shear_bound), 3)
         return zero.scatter_add(-2, self.corners.unsqueeze(-1).expand(values.shape), values)
 
-    def columns(self, x: Tensor) -> tuple[Tensor, Tensor]:
+    def deformation_columns(self, x: Tensor) -> tuple[Tensor, Tensor]:
         """Deformation gradient's warp and weft columns [..., E, 3]; of velocities, their rates."""
         x0, x1, x2 = self.at_corners(x)
         (a1, b1), (a2, b2) = self.gradient[1], self.gradient[2]
         return a1 * (x1 - x0) + a2 * (x2 - x0), b1 * (x1 - x0) + b2 * (x2 - x0)
 
-    def force(self, p1: Tensor, p2: Tensor) -> Tensor:
+    def stress_force(self, p1: Tensor, p2: Tensor) -> Tensor:
         """Forces [..., V, 3] N of the columns [..., E, 3] N/m of a first Piola stress."""
         second, third = (-self.area * (g[0] * p1 + g[1] * p2) for g in self.gradient[1:])
-        return self.summed([-(second + third), second, third])
+        return self.sum_on_vertices([-(second + third), second, third])

@@ -10,7 +10,7 @@ from .._utils.linalg import dot
 from ..errors import InvalidInput
 from ..meshes import Mesh
 from ..parameters import PhysicalParameter
-from ..types import Moment, Surface
+from ..types import EffectInputs, Surface
 from ._triangles import Triangles
 from .base import AbstractEffect, Amplitude
 
@@ -57,13 +57,13 @@ class AddedMass(AbstractEffect):
         """Mass of the air over each triangle's rest area."""
         return c * surface.area
 
-    def force(self, c: Tensor, now: Moment) -> Tensor:
+    def force(self, c: Tensor, now: EffectInputs) -> Tensor:
         """-m_air n (v . dn/dt) at the corners, where dn/dt = -(grad v)' n along the sheet; ``inertia`` is n . dv/dt."""
         s = now.surface
-        rate1, rate2 = self.triangles.columns(now.v)
+        rate1, rate2 = self.triangles.deformation_columns(now.v)
         turning = dot(rate1, s.n) * s.cofactor1 + dot(rate2, s.n) * s.cofactor2  # -J dn/dt
         share = c * s.area / (3 * s.J) * s.n
-        return self.triangles.summed([share * dot(v, turning) for v in self.triangles.at_corners(now.v)])
+        return self.triangles.sum_on_vertices([share * dot(v, turning) for v in self.triangles.at_corners(now.v)])
 
     def extra_repr(self) -> str:
         """One line of the data sheet."""

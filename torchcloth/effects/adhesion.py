@@ -9,14 +9,14 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from .._utils.vectors import direction, place
+from .._utils.vectors import parse_unit_vector, parse_vector
 from ..errors import InvalidInput
 from ..meshes import Mesh
 from ..parameters import PhysicalParameter
-from ..types import Moment
+from ..types import EffectInputs
 from .base import AbstractEffect, Amplitude
 
-STEEPEST = 8 / 3 / 3**0.5  # largest slope of (1 - u^2)^2, at u = 3^-1/2
+MAX_PULL_SLOPE = 8 / 3 / 3**0.5  # largest slope of (1 - u^2)^2, at u = 3^-1/2
 
 
 class Adhesion(AbstractEffect):
@@ -55,8 +55,8 @@ class Adhesion(AbstractEffect):
             raise InvalidInput("adhesion gap", got=f"{gap:g} m", expected="a length > 0")
         self.stress = PhysicalParameter(stress, "Pa", "nonnegative", name="adhesion stress")
         self.gap = float(gap)
-        self.register_buffer("point", place("adhesion point", point), persistent=False)
-        self.register_buffer("normal", direction("adhesion normal", normal), persistent=False)
+        self.register_buffer("point", parse_vector("adhesion point", point), persistent=False)
+        self.register_buffer("normal", parse_unit_vector("adhesion normal", normal), persistent=False)
         self.register_buffer("area", torch.zeros(0, 1), persistent=False)
         self.point: Tensor
         self.normal: Tensor
@@ -72,15 +72,15 @@ class Adhesion(AbstractEffect):
         """[..., 1, 1] Pa."""
         return self.stress.field
 
-    def force(self, c: Tensor, now: Moment) -> Tensor:
+    def force(self, c: Tensor, now: EffectInputs) -> Tensor:
         """Force on each vertex."""
         height = (now.x - self.point) @ self.normal.unsqueeze(-1)
         u = (height / self.gap).clamp(0.0, 1.0)
         return -(c * self.area * (1 - u * u) ** 2) * self.normal
 
-    def rates(self, c: Tensor, mass: Tensor) -> tuple[Tensor, Tensor]:
+    def stability_bounds(self, c: Tensor, mass: Tensor) -> tuple[Tensor, Tensor]:
         """The steepest slope of the pull bounds omega^2."""
-        return STEEPEST / self.gap * (c * self.area / mass).amax(), mass.new_zeros(())
+        return MAX_PULL_SLOPE / self.gap * (c * self.area / mass).amax(), mass.new_zeros(())
 
     def extra_repr(self) -> str:
         """One line of the data sheet."""

@@ -11,11 +11,11 @@ import torch
 from torch import Tensor, nn
 
 from .._utils.linalg import dot, safe_norm
-from .._utils.vectors import numbers
+from .._utils.vectors import parse_finite_numbers
 from ..errors import InvalidInput
 from ..meshes import Mesh
 from ..parameters import PhysicalParameter
-from ..types import Moment
+from ..types import EffectInputs
 from .base import AbstractEffect, Amplitude
 
 
@@ -65,7 +65,7 @@ class AirDrag(AbstractEffect):
             raise InvalidInput("air density", got=f"{density} kg/m^3", expected="a value > 0")
         self.normal = PhysicalParameter(normal, "-", "nonnegative", name="air drag coefficient")
         self.tangential = PhysicalParameter(tangential, "-", "nonnegative", name="tangential air drag coefficient")
-        self.wind = nn.Parameter(numbers("wind", wind, 3, "three finite numbers in m/s").clone())
+        self.wind = nn.Parameter(parse_finite_numbers("wind", wind, 3, "three finite numbers in m/s").clone())
         self.density = float(density)
         self.register_buffer("share", torch.zeros(0, 1), persistent=False)
         self.register_buffer("rim", torch.zeros(0, 1), persistent=False)
@@ -85,7 +85,7 @@ class AirDrag(AbstractEffect):
         half = 0.5 * self.density
         return Coefficients(half * self.normal.field, half * self.tangential.field, self.wind.unsqueeze(-2))
 
-    def force(self, c: Coefficients, now: Moment) -> Tensor:
+    def force(self, c: Coefficients, now: EffectInputs) -> Tensor:
         """Drag on each triangle."""
         surface = now.surface
         relative = surface.v - c.wind
@@ -94,7 +94,7 @@ class AirDrag(AbstractEffect):
         area = surface.area * surface.J
         return -(c.pressure * area * speed.abs() * speed) * surface.n - (c.friction * area * safe_norm(along)) * along
 
-    def rates(self, c: Coefficients, mass: Tensor) -> tuple[Tensor, Tensor]:
+    def stability_bounds(self, c: Coefficients, mass: Tensor) -> tuple[Tensor, Tensor]:
         """Of a sheet at rest in the wind (row sums): drag is linear about it, and its pressure turns with the sheet.
 
         With f(u, N) for the area vector N: |df/du| <= 2 max(P, Q) |u| a, |df/dN| <= 3 (P + Q) |u|^2, and a corner moves

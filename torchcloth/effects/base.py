@@ -11,7 +11,7 @@ from torch import Tensor, nn
 
 from ..errors import InvalidInput
 from ..meshes import Mesh
-from ..types import Moment, Surface
+from ..types import EffectInputs, Surface
 
 
 class Amplitude(NamedTuple):
@@ -52,7 +52,7 @@ class AbstractEffect(nn.Module, ABC):
         per_triangle: names of parameters that may have a value for each triangle, all others being scalars or batches
             of them; None: not said, so not checked.
         acts_on: whether ``force`` returns one row per vertex, or one per triangle (shared equally by its corners).
-        grasp: name of the boundary that ``loosen`` belongs to.
+        grasp: name of the boundary that ``grip_velocities`` belongs to.
     """
 
     amplitudes: ClassVar[Mapping[str, Amplitude]]
@@ -73,14 +73,14 @@ class AbstractEffect(nn.Module, ABC):
     def coefficients(self) -> Any:
         """What the methods below need of the learnable parameters; called once per rollout."""
 
-    def force(self, c: Any, now: Moment) -> Tensor | None:
+    def force(self, c: Any, now: EffectInputs) -> Tensor | None:
         """[..., V, 3] or [..., E, 3] N (see ``acts_on``)."""
         return None
 
-    def viscous(self, c: Any, now: Moment) -> Tensor | None:
+    def viscous(self, c: Any, now: EffectInputs) -> Tensor | None:
         """[..., V, 3] N: the part of ``force`` that is linear in velocity, if it may be stiff; then it costs no steps.
 
-        At fixed positions it is -C v with C symmetric and not negative. ``viscous_rate`` must be there as well, and
+        At fixed positions it is -C v with C symmetric and not negative. ``viscous_stability_bound`` must be there as well, and
         ``force`` one of the vertices.
         """
         return None
@@ -93,49 +93,49 @@ class AbstractEffect(nn.Module, ABC):
         """[..., E, 1] kg that a triangle must move along its normal only."""
         return None
 
-    def growth(self, c: Any) -> Tensor | None:
+    def rest_deformation(self, c: Any) -> Tensor | None:
         """[..., E or 1, 2, 2], columns: where the warp and weft of the pattern lie in the true rest shape."""
         return None
 
-    def yielding(self, c: Any) -> float:
-        """m/(N s): most speed that ``loosen`` gives for a force; viscous forces on what yields much take no stages."""
+    def grip_compliance(self, c: Any) -> float:
+        """m/(N s): most speed that ``grip_velocities`` gives for a force; viscous forces on what yields much take no stages."""
         return 0.0 if self.grasp is None else math.inf
 
-    def loosen(
+    def grip_velocities(
         self,
         c: Any,
         index: Tensor,
         free: Tensor,
-        held: Tensor,
+        gripped: Tensor,
         mass: Tensor,
         dt: float,
-        resistance: Tensor | None,
+        added_mass_ratio: Tensor | None,
     ) -> Tensor:
         """Velocities of the held vertices ``index`` in an imperfect grip, from those ``free`` of it and ``held`` by it.
 
         All of ``free``, ``held`` and the result are [..., V, 3] m/s. ``resistance`` [..., V, 3, 3] is the mass of the
         air that moves along, over the ``mass`` [..., V, 1] kg of the vertices; None: none does.
         """
-        return held
+        return gripped
 
-    def start(self, x: Tensor) -> Tensor | None:
+    def initial_memory(self, x: Tensor) -> Tensor | None:
         """Internal variables [..., N, K] of a virgin cloth at positions [..., V, 3]; None: remembers nothing."""
         return None
 
-    def evolve(self, c: Any, now: Moment) -> Tensor:
+    def update_memory(self, c: Any, now: EffectInputs) -> Tensor:
         """Internal variables at ``now``, from those of the substep before (``now.memory``); called before ``force``."""
-        raise NotImplementedError(f"{type(self).__name__} starts internal variables but does not evolve them")
+        raise NotImplementedError(f"{type(self).__name__} starts internal variables but does not update_memory them")
 
-    def rates(self, c: Any, mass: Tensor) -> tuple[Tensor, Tensor]:
+    def stability_bounds(self, c: Any, mass: Tensor) -> tuple[Tensor, Tensor]:
         """(bound on omega^2 [1/s^2], bound on the linear damping rate [1/s]) that this effect adds; limits the step."""
         return mass.new_zeros(()), mass.new_zeros(())
 
-    def viscous_rate(self, c: Any, mass: Tensor) -> Tensor:
+    def viscous_stability_bound(self, c: Any, mass: Tensor) -> Tensor:
         """What of that damping rate [1/s] is ``viscous``."""
         return mass.new_zeros(())
 
 
-def remembered(now: Moment) -> Tensor:
+def require_memory(now: EffectInputs) -> Tensor:
     """The internal variables, for an effect that cannot do without.
 
     Raises:

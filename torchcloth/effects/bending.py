@@ -13,10 +13,10 @@ from .._utils.linalg import dot
 from ..errors import InvalidInput
 from ..meshes import Mesh
 from ..parameters import PhysicalParameter
-from ..types import Moment
-from ._bent import BentSheet, differences
-from ._curvature import curvature_stencils, gathered, largest_eigenvalue, local_matrices, mixed_area, pattern
-from ._plate import Operator, Plate
+from ..types import EffectInputs
+from ._bent import BendingStencil, neighbour_differences
+from ._curvature import curvature_stencils, sum_entries, largest_eigenvalue, local_matrices, mixed_area, find_sparsity_pattern
+from ._plate import PlateOperator, Plate
 from .base import AbstractEffect, Amplitude
 
 
@@ -97,7 +97,7 @@ class Bending(AbstractEffect):
         self.operator: Tensor  # [D, V, 1] 1/m^2: minus the off-diagonal entries of Q for B = 1
         self.bound: Tensor  # [V, 1] 1/m^2: each vertex's area times the largest eigenvalue of Q over the areas
         self.faces: Tensor  # [E, 3]
-        self.sheet, self.woven = BentSheet(), Operator()
+        self.stencil, self.plate_operator = BendingStencil(), PlateOperator()
 
     def bind(self, mesh: Mesh) -> Bending:
         """Build the curvature stencils of the mesh's vertices and the matrix Q.
@@ -115,9 +115,9 @@ class Bending(AbstractEffect):
         self.operator = torch.as_tensor(-plate.entries.T.copy(), dtype=dtype, device=device).unsqueeze(-1)
         self.bound = torch.as_tensor(plate.bound.copy(), dtype=dtype, device=device).unsqueeze(-1)
         self.faces = torch.as_tensor(mesh.faces.copy(), device=device)
-        self.sheet.bind(mesh, device)
+        self.stencil.bind(mesh, device)
         if self._uneven(size):
-            self.woven.bind(curvature_stencils(mesh), mixed_area(mesh), device)
+            self.plate_operator.bind(curvature_stencils(mesh), mixed_area(mesh), device)
         return self
 
     def _uneven(self, size: int) -> bool:
@@ -141,7 +141,7 @@ class Bending(AbstractEffect):
             viscosity = torch.zeros_like(field) if time is None else field * time
             plate = None if curl is None else self._plate(field)
             return Coefficients(field, viscosity, None, plate, curl)
-        if not len(self.woven.locals):
+        if not len(self.plate_operator.locals):
             raise InvalidInput(
                 "bending stiffness",
                 got=f"{field.shape[-2]} values for an effect that was made with one",
@@ -150,14 +150,14 @@ class Bending(AbstractEffect):
             )
         plate = self._plate(field if field.shape[-2] == 1 else self._on_vertices(field))
         time = torch.zeros_like(field[..., :1, :]) if time is None else time
-        return Coefficients(torch.ones_like(time), time, self.woven.entries(plate), plate, curl)
+        return Coefficients(torch.ones_like(time), time, self.plate_operator.entries(plate), plate, curl)
 
-    def curved(self) -> bool:
+    def has_rest_curvature(self) -> bool:
         """Whether the sheet may be other than flat at rest."""
         return self.curl_warp is not None or self.curl_weft is not None
 
     def _curl(self, like: Tensor) -> Tensor | None:
-        if not self.curved():
+        if not self.has_rest_curvature():
             return None
         zero = like.new_zeros(1, 1)
         warp, weft = (zero if curl is None else curl.field for curl in (self.curl_warp, self.curl_weft))
@@ -179,7 +179,7 @@ class Bending(AbstractEffect):
         here = field.new_zeros(count, 1).index_add(0, index, field.new_ones(len(index), 1))
         return total / here
 
-    def force(self, c: Coefficients, now: Moment) -> Tensor:
+    def force(self, c: Coefficients, now: EffectInputs) -> Tensor:
         """-Q (x + damping_time v) on each vertex, and what rest curvature adds."""
         field = c.stiffness * now.x
         if self.damping_time is not None:
@@ -187,43 +187,43 @@ class Bending(AbstractEffect):
         force = self._straightened(c, field)
         if c.curl is None or c.plate is None:
             return force
-        return force - self.sheet.force(
-            self.sheet.see(now.x, now.lost), c.plate.moment(self.rest_curvature(c.curl, now))
+        return force - self.stencil.moment_force(
+            self.stencil.fit_surface(now.x, now.compensation), c.plate.moment(self.rest_curvature(c.curl, now))
         )
 
-    def viscous(self, c: Coefficients, now: Moment) -> Tensor | None:
+    def viscous(self, c: Coefficients, now: EffectInputs) -> Tensor | None:
         """-Q damping_time v."""
         return None if self.damping_time is None else self._straightened(c, c.viscosity * now.v)
 
     def _straightened(self, c: Coefficients, field: Tensor) -> Tensor:
         """-Q field."""
         if c.operator is None:
-            return (self.operator * differences(field, self.columns)).sum(-3)
-        operator = c.operator.unflatten(-2, self.woven.columns.shape)
-        return (operator * differences(field, self.woven.columns)).sum(-3)
+            return (self.operator * neighbour_differences(field, self.columns)).sum(-3)
+        operator = c.operator.unflatten(-2, self.plate_operator.columns.shape)
+        return (operator * neighbour_differences(field, self.plate_operator.columns)).sum(-3)
 
-    def rest_curvature(self, curl: Tensor, now: Moment) -> Tensor:
+    def rest_curvature(self, curl: Tensor, now: EffectInputs) -> Tensor:
         """[..., V or 1, 3] 1/m along ww, ff, sqrt 2 wf; ``curl`` is that of the virgin sheet."""
         return curl
 
     def energy(self, c: Coefficients, x: Tensor) -> Tensor:
         """Bending energy [...] J."""
-        bent = self.sheet.see(x)
+        bent = self.stencil.fit_surface(x)
         plate = self._plate(c.stiffness) if c.plate is None else c.plate
-        density = plate.energy(bent.second)
+        density = plate.energy(bent.second_derivatives)
         if c.curl is not None:
             density = density + dot(c.curl / 2 - bent.curvature, plate.moment(c.curl))
-        return (self.sheet.area * density).sum((-2, -1))
+        return (self.stencil.area * density).sum((-2, -1))
 
-    def rates(self, c: Coefficients, mass: Tensor) -> tuple[Tensor, Tensor]:
+    def stability_bounds(self, c: Coefficients, mass: Tensor) -> tuple[Tensor, Tensor]:
         """B times the largest eigenvalue of Q over the vertices' masses, bounded by that for equal areal density."""
         stiffness = c.stiffness.amax() * self._spectrum(c, mass)
         if c.curl is not None and c.plate is not None:
             moment = c.plate.moment(c.curl).square().sum(-1).amax().sqrt()
-            stiffness = stiffness + moment * self.sheet.turn_rate(mass)
-        return stiffness, self.viscous_rate(c, mass)
+            stiffness = stiffness + moment * self.stencil.turning_bound_over(mass)
+        return stiffness, self.viscous_stability_bound(c, mass)
 
-    def viscous_rate(self, c: Coefficients, mass: Tensor) -> Tensor:
+    def viscous_stability_bound(self, c: Coefficients, mass: Tensor) -> Tensor:
         """All damping there is."""
         return c.viscosity.amax() * self._spectrum(c, mass)
 
@@ -231,7 +231,7 @@ class Bending(AbstractEffect):
         """Largest eigenvalue of Q over the masses, times the stiffness where ``c.operator`` holds it."""
         if c.operator is None or c.plate is None:
             return (self.bound / mass).amax()
-        return c.plate.largest() * self.sheet.bend_rate(mass)
+        return c.plate.eigenvalue_bound() * self.stencil.bending_bound_over(mass)
 
     def extra_repr(self) -> str:
         """One line of the data sheet."""
@@ -255,8 +255,8 @@ def _plate(mesh: Mesh, poisson: float) -> _Even:
     stencils, area, share = curvature_stencils(mesh), mixed_area(mesh), mesh.vertex_area
     form = stencils.second @ np.linalg.cholesky(_isotropic(poisson)) * np.sqrt(area)[:, None, None]
     local = local_matrices(form)
-    shape = pattern(stencils.near, local)
-    entries = gathered(shape, local)
+    shape = find_sparsity_pattern(stencils.neighbours, local)
+    entries = sum_entries(shape, local)
     return _Even(shape.columns, entries, share * largest_eigenvalue(shape.columns, entries, share))
 
 

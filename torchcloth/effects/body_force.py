@@ -7,7 +7,7 @@ from torch import Tensor
 from ..errors import InvalidInput
 from ..meshes import Mesh
 from ..parameters import PhysicalParameter
-from ..types import Moment
+from ..types import EffectInputs
 from .base import AbstractEffect, Amplitude
 
 
@@ -46,6 +46,6 @@ class BodyForce(AbstractEffect):
         """[..., V or 1, 3] m/s^2."""
         return self.acceleration.value
 
-    def force(self, c: Tensor, now: Moment) -> Tensor:
+    def force(self, c: Tensor, now: EffectInputs) -> Tensor:
         """m a on each vertex."""
         return now.mass * c

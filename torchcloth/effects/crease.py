@@ -11,8 +11,8 @@ from torch import Tensor
 from .._utils.linalg import safe_norm
 from ..errors import InvalidInput
 from ..parameters import PhysicalParameter
-from ..types import Moment
-from .base import Amplitude, remembered
+from ..types import EffectInputs
+from .base import Amplitude, require_memory
 from .bending import Bending, Coefficients
 
 
@@ -52,7 +52,7 @@ class CreasingBending(Bending):
         self.mobility = PhysicalParameter(mobility, "1/s", "nonnegative", name="crease mobility")
         self.yield_curvature = float(yield_curvature)
 
-    def curved(self) -> bool:
+    def has_rest_curvature(self) -> bool:
         """Always, it may have creases."""
         return True
 
@@ -60,22 +60,22 @@ class CreasingBending(Bending):
         """Those of the elastic sheet, and the mobility [..., 1, 1] 1/s."""
         return super().coefficients()._replace(mobility=self.mobility.field)
 
-    def start(self, x: Tensor) -> Tensor:
+    def initial_memory(self, x: Tensor) -> Tensor:
         """[..., V, 3]: creases [1/m] along ww, ff, sqrt 2 wf; none."""
         return torch.zeros_like(x)
 
-    def evolve(self, c: Coefficients, now: Moment) -> Tensor:
+    def update_memory(self, c: Coefficients, now: EffectInputs) -> Tensor:
         """The excess of the elastic curvature flows into the crease."""
-        crease, curl, mobility = remembered(now), cast("Tensor", c.curl), cast("Tensor", c.mobility)
-        elastic = self.sheet.see(now.x, now.lost).curvature - curl - crease
+        crease, curl, mobility = require_memory(now), cast("Tensor", c.curl), cast("Tensor", c.mobility)
+        elastic = self.stencil.fit_surface(now.x, now.compensation).curvature - curl - crease
         size = safe_norm(elastic)
         bent = size > self.yield_curvature
         excess = torch.where(bent, 1 - self.yield_curvature / torch.where(bent, size, 1.0), 0.0)
         return crease - torch.expm1(-mobility * now.dt) * excess * elastic
 
-    def rest_curvature(self, curl: Tensor, now: Moment) -> Tensor:
+    def rest_curvature(self, curl: Tensor, now: EffectInputs) -> Tensor:
         """Curl and creases."""
-        return curl + remembered(now)
+        return curl + require_memory(now)
 
     def energy(self, c: Coefficients, x: Tensor, memory: Tensor | None = None) -> Tensor:
         """Bending energy [...] J of a sheet with the creases ``memory`` [..., V, 3] 1/m; None: of a virgin one."""

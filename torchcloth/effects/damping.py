@@ -5,7 +5,7 @@ from __future__ import annotations
 from torch import Tensor
 
 from ..parameters import PhysicalParameter
-from ..types import Moment
+from ..types import EffectInputs
 from .base import AbstractEffect, Amplitude
 
 
@@ -32,10 +32,10 @@ class MassDamping(AbstractEffect):
         """[..., 1, 1] 1/s."""
         return self.rate.field
 
-    def force(self, c: Tensor, now: Moment) -> Tensor:
+    def force(self, c: Tensor, now: EffectInputs) -> Tensor:
         """Force on each vertex."""
         return -(c * now.mass) * now.v
 
-    def rates(self, c: Tensor, mass: Tensor) -> tuple[Tensor, Tensor]:
+    def stability_bounds(self, c: Tensor, mass: Tensor) -> tuple[Tensor, Tensor]:
         """The rate itself."""
         return mass.new_zeros(()), c.amax()

@@ -8,11 +8,11 @@ from torch import Tensor
 from .._utils.linalg import cross, dot
 from ..meshes import Mesh
 from ..parameters import PhysicalParameter
-from ..types import Moment
-from ._bent import BentSheet
-from ._dahl import check_threshold, dragged
+from ..types import EffectInputs
+from ._bent import BendingStencil
+from ._dahl import check_threshold, update_dahl_fraction
 from ._triangles import Triangles
-from .base import AbstractEffect, Amplitude, remembered
+from .base import AbstractEffect, Amplitude, require_memory
 
 
 class BendingFriction(AbstractEffect):
@@ -38,36 +38,36 @@ class BendingFriction(AbstractEffect):
         super().__init__()
         self.moment = PhysicalParameter(moment, "N", "nonnegative", name="bending friction moment")
         self.threshold = check_threshold(threshold, "bending friction", "1/m")
-        self.sheet = BentSheet()
+        self.stencil = BendingStencil()
 
     def bind(self, mesh: Mesh) -> BendingFriction:
         """Build the curvature stencils."""
-        self.sheet.bind(mesh, device=self.moment.raw.device)
+        self.stencil.bind(mesh, device=self.moment.raw.device)
         return self
 
     def coefficients(self) -> Tensor:
         """HB [..., 1, 1] N."""
         return self.moment.field
 
-    def start(self, x: Tensor) -> Tensor:
+    def initial_memory(self, x: Tensor) -> Tensor:
         """[..., V, 6]: curvature where the sheet is [1/m], and z / HB = 0."""
-        k = self.sheet.see(x).curvature
+        k = self.stencil.fit_surface(x).curvature
         return torch.cat([k, torch.zeros_like(k)], dim=-1)
 
-    def evolve(self, c: Tensor, now: Moment) -> Tensor:
+    def update_memory(self, c: Tensor, now: EffectInputs) -> Tensor:
         """Dahl's law along the change of curvature."""
         before, share = _halves(now)
-        k = self.sheet.see(now.x, now.lost).curvature
-        return torch.cat([k, dragged(share, k - before, self.threshold)], dim=-1)
+        k = self.stencil.fit_surface(now.x, now.compensation).curvature
+        return torch.cat([k, update_dahl_fraction(share, k - before, self.threshold)], dim=-1)
 
-    def force(self, c: Tensor, now: Moment) -> Tensor:
+    def force(self, c: Tensor, now: EffectInputs) -> Tensor:
         """That of the moment z."""
         _, share = _halves(now)
-        return self.sheet.force(self.sheet.see(now.x, now.lost), c * share)
+        return self.stencil.moment_force(self.stencil.fit_surface(now.x, now.compensation), c * share)
 
-    def rates(self, c: Tensor, mass: Tensor) -> tuple[Tensor, Tensor]:
+    def stability_bounds(self, c: Tensor, mass: Tensor) -> tuple[Tensor, Tensor]:
         """Twice the sticking stiffness, which is what a reversal out of sliding meets, and z's turning."""
-        per_moment = 2 / self.threshold * self.sheet.bend_rate(mass) + self.sheet.turn_rate(mass)
+        per_moment = 2 / self.threshold * self.stencil.bending_bound_over(mass) + self.stencil.turning_bound_over(mass)
         return c.amax() * per_moment, mass.new_zeros(())
 
     def extra_repr(self) -> str:
@@ -111,30 +111,30 @@ class ShearFriction(AbstractEffect):
         """HG [..., 1, 1] N/m."""
         return 0.5 * self.hysteresis.field
 
-    def start(self, x: Tensor) -> Tensor:
+    def initial_memory(self, x: Tensor) -> Tensor:
         """[..., E, 2]: shear angle where the sheet is [rad], and z / HG = 0."""
-        f1, f2 = self.triangles.columns(x)
+        f1, f2 = self.triangles.deformation_columns(x)
         normal = cross(f1, f2)
         angle = _angle(f1, f2, dot(normal, normal).sqrt())
         return torch.cat([angle, torch.zeros_like(angle)], dim=-1)
 
-    def evolve(self, c: Tensor, now: Moment) -> Tensor:
+    def update_memory(self, c: Tensor, now: EffectInputs) -> Tensor:
         """Dahl's law along the change of angle."""
         before, share = _halves(now)
         angle = _angle(now.surface.f1, now.surface.f2, now.surface.J)
-        return torch.cat([angle, dragged(share, angle - before, self.threshold)], dim=-1)
+        return torch.cat([angle, update_dahl_fraction(share, angle - before, self.threshold)], dim=-1)
 
-    def force(self, c: Tensor, now: Moment) -> Tensor:
+    def force(self, c: Tensor, now: EffectInputs) -> Tensor:
         """That of the stress z, which works on the angle alone."""
         _, share = _halves(now)
         s = now.surface
         sine = dot(s.f1, s.f2)
         scale = c * share / (sine**2 + s.J**2)
-        return self.triangles.force(
+        return self.triangles.stress_force(
             scale * (s.J * s.f2 - sine * s.cofactor1), scale * (s.J * s.f1 - sine * s.cofactor2)
         )
 
-    def rates(self, c: Tensor, mass: Tensor) -> tuple[Tensor, Tensor]:
+    def stability_bounds(self, c: Tensor, mass: Tensor) -> tuple[Tensor, Tensor]:
         """Twice the sticking stiffness, which is what a reversal out of sliding meets."""
         return 2 / self.threshold * c.amax() * (self.triangles.shear_bound / mass).amax(), mass.new_zeros(())
 
@@ -147,6 +147,6 @@ def _angle(f1: Tensor, f2: Tensor, area: Tensor) -> Tensor:
     return torch.atan2(dot(f1, f2), area)
 
 
-def _halves(now: Moment) -> tuple[Tensor, Tensor]:
-    before, share = remembered(now).chunk(2, dim=-1)
+def _halves(now: EffectInputs) -> tuple[Tensor, Tensor]:
+    before, share = require_memory(now).chunk(2, dim=-1)
     return before, share

@@ -7,8 +7,8 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor, nn
 
-from .._utils.vectors import numbers
-from ..types import Moment
+from .._utils.vectors import parse_finite_numbers
+from ..types import EffectInputs
 from .base import AbstractEffect, Amplitude
 
 
@@ -42,7 +42,7 @@ class Gravity(AbstractEffect):
         x, z = cos_y * x + sin_y * z, cos_y * z - sin_y * x
         return torch.stack([x, y, z], dim=-1).unsqueeze(-2)
 
-    def force(self, c: Tensor, now: Moment) -> Tensor:
+    def force(self, c: Tensor, now: EffectInputs) -> Tensor:
         """m g on each vertex."""
         return now.mass * c
 
@@ -53,4 +53,4 @@ class Gravity(AbstractEffect):
 
 
 def _vector(name: str, values: Sequence[float], size: int, expected: str) -> nn.Parameter:
-    return nn.Parameter(numbers(name, values, size, expected).clone())
+    return nn.Parameter(parse_finite_numbers(name, values, size, expected).clone())

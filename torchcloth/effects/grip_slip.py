@@ -7,7 +7,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from .._utils.linalg import dot, loaded, safe_norm, times
+from .._utils.linalg import dot, apply_added_mass, safe_norm, matvec
 from ..parameters import PhysicalParameter
 from .base import AbstractEffect, Amplitude
 
@@ -55,35 +55,35 @@ class GripSlip(AbstractEffect):
         """The parameters as fields."""
         return Coefficients(self.mobility.field, self.hold.field)
 
-    def yielding(self, c: Coefficients) -> float:
+    def grip_compliance(self, c: Coefficients) -> float:
         """The mobility."""
         return float(c.mobility.detach().max())
 
-    def loosen(
+    def grip_velocities(
         self,
         c: Coefficients,
         index: Tensor,
         free: Tensor,
-        held: Tensor,
+        gripped: Tensor,
         mass: Tensor,
         dt: float,
-        resistance: Tensor | None,
+        added_mass_ratio: Tensor | None,
     ) -> Tensor:
         """The patch moves on with the same velocity all over, so that its pull falls to what the law says."""
         patch = mass.index_select(-2, index)
-        air = None if resistance is None else resistance.index_select(-3, index)
-        change = (held - free).index_select(-2, index)
-        impulse = (patch * loaded(air, change)).sum(-2, keepdim=True)
+        air = None if added_mass_ratio is None else added_mass_ratio.index_select(-3, index)
+        change = (gripped - free).index_select(-2, index)
+        impulse = (patch * apply_added_mass(air, change)).sum(-2, keepdim=True)
         size = safe_norm(impulse)
         inertia = patch.sum(-2, keepdim=True)
         if air is not None:
             way = impulse / torch.where(size > 0, size, 1.0)
-            inertia = inertia + dot(way, times((patch.unsqueeze(-1) * air).sum(-3, keepdim=True), way))
+            inertia = inertia + dot(way, matvec((patch.unsqueeze(-1) * air).sum(-3, keepdim=True), way))
         slips = size > c.hold * dt
         excess = torch.where(slips, 1 - c.hold * dt / torch.where(slips, size, 1.0), 0.0)
         creep = -(c.mobility * excess / (dt + c.mobility * inertia)) * impulse
         creep = creep.expand(*creep.shape[:-2], len(index), 3)
-        return held.expand(*creep.shape[:-2], -1, -1).index_add(-2, index, creep)
+        return gripped.expand(*creep.shape[:-2], -1, -1).index_add(-2, index, creep)
 
     def extra_repr(self) -> str:
         """One line of the data sheet."""

@@ -15,7 +15,7 @@ from ..meshes import Mesh
 from ..parameters import PhysicalParameter
 from .base import AbstractEffect, Amplitude
 
-ON_EDGE = 1e-9  # barycentric weight, by which a line may be beside a triangle
+EDGE_WEIGHT_TOLERANCE = 1e-9  # barycentric weight, by which a line may be beside a triangle
 
 
 class LineMass(AbstractEffect):
@@ -132,7 +132,7 @@ def _within(mesh: Mesh, corners: np.ndarray, start: np.ndarray, end: np.ndarray)
     offset = np.stack([start, end]) - corners[:, :1]  # [F, 2, 2]
     second = np.linalg.solve(sides[:, None], offset[..., None])[..., 0]
     weight = np.concatenate([1 - second.sum(-1, keepdims=True), second], -1)  # [F, 2, 3], linear along the line
-    a, slope = weight[:, 0] + ON_EDGE, weight[:, 1] - weight[:, 0]
+    a, slope = weight[:, 0] + EDGE_WEIGHT_TOLERANCE, weight[:, 1] - weight[:, 0]
     with np.errstate(divide="ignore", invalid="ignore"):
         zero = -a / slope
     out = np.where(slope == 0, a < 0, False).any(-1)

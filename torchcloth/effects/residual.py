@@ -13,38 +13,38 @@ from .._utils.linalg import dot, safe_norm
 from ..errors import InvalidInput
 from ..meshes import Mesh
 from ..parameters import PhysicalParameter
-from ..types import Moment
-from ._bent import BentSheet
+from ..types import EffectInputs
+from ._bent import BendingStencil
 from ._triangles import Triangles
 from .base import AbstractEffect, Amplitude
-from .viscous import largest_strain_rate, strain_rate_force
+from .viscous import largest_strain_rate_eigenvalue, strain_rate_force
 
 
-class Law(NamedTuple):
+class ResidualLaw(NamedTuple):
     """One way to push."""
 
     unit: str
     typical: float
-    told: str  # what a positive coefficient does
+    description: str  # what a positive coefficient does
 
 
-LAWS = {
-    "across": Law("Pa s/m", 0.5, "opposes motion across the cloth, in proportion to speed"),
-    "across2": Law("Pa s^2/m^2", 0.7, "opposes motion across the cloth, growing as speed squared"),
-    "along": Law("Pa s/m", 0.2, "opposes motion along the cloth, in proportion to speed"),
-    "along2": Law("Pa s^2/m^2", 0.3, "opposes motion along the cloth, growing as speed squared"),
-    "mass": Law("kg/m^2", 0.1, "is weight and inertia"),
-    "strain_rate": Law("N s/m", 0.5, "opposes stretching and shearing, in proportion to their speed"),
-    "bend": Law("N m", 1e-4, "opposes bending"),
+RESIDUAL_LAWS = {
+    "across": ResidualLaw("Pa s/m", 0.5, "opposes motion across the cloth, in proportion to speed"),
+    "across2": ResidualLaw("Pa s^2/m^2", 0.7, "opposes motion across the cloth, growing as speed squared"),
+    "along": ResidualLaw("Pa s/m", 0.2, "opposes motion along the cloth, in proportion to speed"),
+    "along2": ResidualLaw("Pa s^2/m^2", 0.3, "opposes motion along the cloth, growing as speed squared"),
+    "mass": ResidualLaw("kg/m^2", 0.1, "is weight and inertia"),
+    "strain_rate": ResidualLaw("N s/m", 0.5, "opposes stretching and shearing, in proportion to their speed"),
+    "bend": ResidualLaw("N m", 1e-4, "opposes bending"),
 }
-PLACES = {"": "everywhere", "edge": "near the free edges", "grip": "near the grippers", "inside": "far from the edges"}
+RESIDUAL_PLACES = {"": "everywhere", "edge": "near the free edges", "grip": "near the grippers", "inside": "far from the edges"}
 
 
-def describe(term: str, coefficient: float) -> str:
+def describe_term(term: str, coefficient: float) -> str:
     """What a term does, in words; the opposite where the coefficient is negative."""
     law, _, place = term.partition("@")
     sign = "" if coefficient > 0 else "the opposite of what "
-    return f"{sign}{LAWS[law].told}, {PLACES[place]}"
+    return f"{sign}{RESIDUAL_LAWS[law].description}, {RESIDUAL_PLACES[place]}"
 
 
 class Coefficients(NamedTuple):
@@ -84,21 +84,21 @@ class ResidualForce(AbstractEffect):
 
     amplitudes = {"strength": Amplitude("of the law", 1.0, 0.1, ("air", "mass_damping", "membrane_viscosity"))}
 
-    def __init__(self, terms: Mapping[str, float], held: Sequence[int] = ()) -> None:
+    def __init__(self, terms: Mapping[str, float], gripped_vertices: Sequence[int] = ()) -> None:
         super().__init__()
-        known = [f"{law}@{place}".rstrip("@") for law in LAWS for place in PLACES]
+        known = [f"{law}@{place}".rstrip("@") for law in RESIDUAL_LAWS for place in RESIDUAL_PLACES]
         if not isinstance(terms, Mapping):
             raise InvalidInput("terms", got=f"{terms!r:.40}", expected="a dict of strengths by law")
         unknown = [term for term in terms if term not in known]
         if unknown or not terms:
             raise InvalidInput(
-                "terms", got=", ".join(unknown) or "none", expected=f"LAW or LAW@PLACE, laws {', '.join(LAWS)}"
+                "terms", got=", ".join(unknown) or "none", expected=f"LAW or LAW@PLACE, laws {', '.join(RESIDUAL_LAWS)}"
             )
-        self.terms, self.held = tuple(terms), tuple(held)
+        self.terms, self.held = tuple(terms), tuple(gripped_vertices)
         self.strength = PhysicalParameter(
             torch.tensor(list(terms.values()), dtype=torch.get_default_dtype()), "SI", "real", name="residual force"
         )
-        self.triangles, self.sheet = Triangles(), BentSheet()
+        self.triangles, self.stencil = Triangles(), BendingStencil()
         for name in ("weights", "on_triangles", "share", "bound"):
             self.register_buffer(name, torch.zeros(0), persistent=False)
         self.weights: Tensor  # [places, V, 1] -
@@ -117,12 +117,12 @@ class ResidualForce(AbstractEffect):
         if wrong:
             raise InvalidInput("held", got=f"vertex {wrong[0]}", expected=f"0 to {len(mesh.vertices) - 1}")
         self.triangles.bind(mesh, self.strength.raw.device)
-        self.sheet.bind(mesh, device=self.strength.raw.device)
+        self.stencil.bind(mesh, device=self.strength.raw.device)
         weights = torch.as_tensor(_places(mesh, self.held), **like)
         self.weights = weights.unsqueeze(-1)
         self.on_triangles = weights[:, torch.as_tensor(mesh.faces)].mean(-1, keepdim=True)
         self.share = torch.as_tensor(mesh.vertex_area, **like).unsqueeze(-1)
-        self.bound = self.share * 3 * largest_strain_rate(mesh.shape_gradient)
+        self.bound = self.share * 3 * largest_strain_rate_eigenvalue(mesh.shape_gradient)
         return self
 
     def coefficients(self) -> Coefficients:
@@ -130,7 +130,7 @@ class ResidualForce(AbstractEffect):
         strength, sums = self.strength.value, {}
         for k, term in enumerate(self.terms):
             law, _, place = term.partition("@")
-            weight = (self.weights if law in ("mass", "bend") else self.on_triangles)[list(PLACES).index(place)]
+            weight = (self.weights if law in ("mass", "bend") else self.on_triangles)[list(RESIDUAL_PLACES).index(place)]
             part = strength[..., k, None, None] * weight
             sums[law] = sums[law] + part if law in sums else part
         return Coefficients(**sums)
@@ -139,7 +139,7 @@ class ResidualForce(AbstractEffect):
         """On the vertices."""
         return None if c.mass is None else c.mass * self.share
 
-    def force(self, c: Coefficients, now: Moment) -> Tensor:
+    def force(self, c: Coefficients, now: EffectInputs) -> Tensor:
         """Of all laws but mass."""
         total = torch.zeros_like(now.x)
         if c.drags:
@@ -148,15 +148,15 @@ class ResidualForce(AbstractEffect):
         if viscous is not None:
             total = total + viscous
         if c.bend is not None:
-            bent = self.sheet.see(now.x)
-            total = total + self.sheet.force(bent, c.bend * bent.curvature)
+            bent = self.stencil.fit_surface(now.x)
+            total = total + self.stencil.moment_force(bent, c.bend * bent.curvature)
         return total
 
-    def viscous(self, c: Coefficients, now: Moment) -> Tensor | None:
+    def viscous(self, c: Coefficients, now: EffectInputs) -> Tensor | None:
         """Of the strain rate."""
         return None if c.strain_rate is None else strain_rate_force(self.triangles, c.strain_rate, now)
 
-    def _dragged(self, c: Coefficients, now: Moment) -> Tensor:
+    def _dragged(self, c: Coefficients, now: EffectInputs) -> Tensor:
         surface = now.surface
         across, along, across2, along2 = (0.0 if p is None else p for p in (c.across, c.along, c.across2, c.along2))
         speed = dot(surface.v, surface.n)
@@ -166,13 +166,13 @@ class ResidualForce(AbstractEffect):
         index = self.triangles.corners.unsqueeze(-1).expand(shares.shape)
         return torch.zeros_like(now.x).expand(*shares.shape[:-2], -1, 3).scatter_add(-2, index, shares)
 
-    def rates(self, c: Coefficients, mass: Tensor) -> tuple[Tensor, Tensor]:
+    def stability_bounds(self, c: Coefficients, mass: Tensor) -> tuple[Tensor, Tensor]:
         """Of a sheet at rest: the laws of speed squared are 0 there."""
         largest = lambda part: mass.new_zeros(()) if part is None else part.abs().amax()  # noqa: E731
         slowed = (largest(c.across) + largest(c.along)) * (self.share / mass).amax()
-        return largest(c.bend) * self.sheet.bend_rate(mass), slowed + self.viscous_rate(c, mass)
+        return largest(c.bend) * self.stencil.bending_bound_over(mass), slowed + self.viscous_stability_bound(c, mass)
 
-    def viscous_rate(self, c: Coefficients, mass: Tensor) -> Tensor:
+    def viscous_stability_bound(self, c: Coefficients, mass: Tensor) -> Tensor:
         """Of the strain rate."""
         return mass.new_zeros(()) if c.strain_rate is None else c.strain_rate.abs().amax() * (self.bound / mass).amax()
 

@@ -50,9 +50,9 @@ class RestShape(AbstractEffect):
     ) -> None:
         super().__init__()
         shorter, turned = (-math.inf, 1.0), (-math.pi / 2, math.pi / 2)
-        self.shrink_warp = PhysicalParameter(shrink_warp, "-", "real", name="shrinkage along the warp", within=shorter)
-        self.shrink_weft = PhysicalParameter(shrink_weft, "-", "real", name="shrinkage along the weft", within=shorter)
-        self.skew = PhysicalParameter(skew, "rad", "real", name="skew", within=turned)
+        self.shrink_warp = PhysicalParameter(shrink_warp, "-", "real", name="shrinkage along the warp", bounds=shorter)
+        self.shrink_weft = PhysicalParameter(shrink_weft, "-", "real", name="shrinkage along the weft", bounds=shorter)
+        self.skew = PhysicalParameter(skew, "rad", "real", name="skew", bounds=turned)
 
     @property
     def has_axes(self) -> bool:
@@ -63,7 +63,7 @@ class RestShape(AbstractEffect):
         """The parameters as fields."""
         return Coefficients(self.shrink_warp.field, self.shrink_weft.field, self.skew.field)
 
-    def growth(self, c: Coefficients) -> Tensor:
+    def rest_deformation(self, c: Coefficients) -> Tensor:
         """Columns: the true warp and weft."""
         warp, weft = 1 - c.shrink_warp, 1 - c.shrink_weft
         rows = torch.broadcast_tensors(warp, weft * c.skew.sin(), torch.zeros_like(warp), weft * c.skew.cos())

@@ -8,8 +8,8 @@ from torch import Tensor
 
 from ..meshes import Mesh
 from ..parameters import PhysicalParameter
-from ..types import Moment
-from ._bent import BentSheet
+from ..types import EffectInputs
+from ._bent import BendingStencil
 from .base import AbstractEffect, Amplitude
 
 
@@ -42,30 +42,30 @@ class SaturatingBending(AbstractEffect):
         super().__init__()
         self.moment = PhysicalParameter(moment, "N", "nonnegative", name="saturating bending moment")
         self.curvature = PhysicalParameter(curvature, "1/m", name="saturating bending curvature")
-        self.sheet = BentSheet()
+        self.stencil = BendingStencil()
 
     def bind(self, mesh: Mesh) -> SaturatingBending:
         """Build the curvature stencils."""
-        self.sheet.bind(mesh, device=self.moment.raw.device)
+        self.stencil.bind(mesh, device=self.moment.raw.device)
         return self
 
     def coefficients(self) -> Coefficients:
         """Resolved once per rollout."""
         return Coefficients(self.moment.field, self.curvature.field)
 
-    def force(self, c: Coefficients, now: Moment) -> Tensor:
+    def force(self, c: Coefficients, now: EffectInputs) -> Tensor:
         """Minus the gradient of the energy."""
-        second = self.sheet.second(now.x)
-        return self.sheet.pull((c.moment / _reach(c, second)).unsqueeze(-3) * second)
+        second = self.stencil.second_derivatives(now.x)
+        return self.stencil.vector_moment_force((c.moment / _reach(c, second)).unsqueeze(-3) * second)
 
     def energy(self, c: Coefficients, x: Tensor) -> Tensor:
         """[...] J."""
-        density = c.moment * (_reach(c, self.sheet.second(x)) - c.curvature)
-        return (self.sheet.area * density).sum((-2, -1))
+        density = c.moment * (_reach(c, self.stencil.second_derivatives(x)) - c.curvature)
+        return (self.stencil.area * density).sum((-2, -1))
 
-    def rates(self, c: Coefficients, mass: Tensor) -> tuple[Tensor, Tensor]:
+    def stability_bounds(self, c: Coefficients, mass: Tensor) -> tuple[Tensor, Tensor]:
         """Stiffest when flat."""
-        return (c.moment / c.curvature).amax() * self.sheet.bend_rate(mass), mass.new_zeros(())
+        return (c.moment / c.curvature).amax() * self.stencil.bending_bound_over(mass), mass.new_zeros(())
 
 
 def _reach(c: Coefficients, second: Tensor) -> Tensor:

@@ -9,7 +9,7 @@ from torch import Tensor
 from .._utils.linalg import dot
 from ..meshes import Mesh
 from ..parameters import PhysicalParameter
-from ..types import Moment
+from ..types import EffectInputs
 from ._triangles import Triangles
 from .base import AbstractEffect, Amplitude
 
@@ -47,7 +47,7 @@ class KelvinVoigt(AbstractEffect):
         """Resolve the triangles, and the bound on their spectrum."""
         device, dtype = self.viscosity.raw.device, torch.get_default_dtype()
         self.triangles.bind(mesh, device)
-        bound = mesh.vertex_area * 3 * largest_strain_rate(mesh.shape_gradient)
+        bound = mesh.vertex_area * 3 * largest_strain_rate_eigenvalue(mesh.shape_gradient)
         self.bound = torch.as_tensor(bound, dtype=dtype, device=device).unsqueeze(-1)
         return self
 
@@ -55,32 +55,32 @@ class KelvinVoigt(AbstractEffect):
         """[..., 1 or E, 1] N s/m."""
         return self.viscosity.field
 
-    def force(self, c: Tensor, now: Moment) -> Tensor:
+    def force(self, c: Tensor, now: EffectInputs) -> Tensor:
         """-area F S G_a on the corners of each triangle, summed on the vertices."""
         return strain_rate_force(self.triangles, c, now)
 
-    def viscous(self, c: Tensor, now: Moment) -> Tensor:
+    def viscous(self, c: Tensor, now: EffectInputs) -> Tensor:
         """All of it."""
         return self.force(c, now)
 
-    def rates(self, c: Tensor, mass: Tensor) -> tuple[Tensor, Tensor]:
+    def stability_bounds(self, c: Tensor, mass: Tensor) -> tuple[Tensor, Tensor]:
         """The largest damping rate of a single triangle on its own share of the vertices' mass (Irons, Treharne)."""
-        return mass.new_zeros(()), self.viscous_rate(c, mass)
+        return mass.new_zeros(()), self.viscous_stability_bound(c, mass)
 
-    def viscous_rate(self, c: Tensor, mass: Tensor) -> Tensor:
+    def viscous_stability_bound(self, c: Tensor, mass: Tensor) -> Tensor:
         """The same."""
         return c.amax() * (self.bound / mass).amax()
 
 
-def strain_rate_force(triangles: Triangles, viscosity: Tensor, now: Moment) -> Tensor:
+def strain_rate_force(triangles: Triangles, viscosity: Tensor, now: EffectInputs) -> Tensor:
     """[..., V, 3] N of the stress viscosity E'."""
     f1, f2 = now.surface.f1, now.surface.f2
-    rate1, rate2 = triangles.columns(now.v)
+    rate1, rate2 = triangles.deformation_columns(now.v)
     e11, e22, e12 = dot(f1, rate1), dot(f2, rate2), 0.5 * (dot(f1, rate2) + dot(f2, rate1))
-    return triangles.force(viscosity * (e11 * f1 + e12 * f2), viscosity * (e12 * f1 + e22 * f2))
+    return triangles.stress_force(viscosity * (e11 * f1 + e12 * f2), viscosity * (e12 * f1 + e22 * f2))
 
 
-def largest_strain_rate(gradient: np.ndarray) -> float:
+def largest_strain_rate_eigenvalue(gradient: np.ndarray) -> float:
     """Largest eigenvalue [1/m^2] of |E'|^2 over the triangles, in the velocities of their corners."""
     gx, gy = gradient[..., 0], gradient[..., 1]
     zero = np.zeros_like(gx)

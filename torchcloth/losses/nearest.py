@@ -5,14 +5,14 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from .._utils.linalg import EXACT, cross
+from .._utils.linalg import EXACT_CDIST_MODE, cross
 from ..engine.library import at_hand
 from ..errors import InvalidInput
 
 LETTERS = {torch.float32: "f", torch.float64: "d"}
 
 
-def nearest(points: Tensor, corners: Tensor, chunk: int) -> tuple[Tensor, Tensor]:
+def find_nearest_triangles(points: Tensor, corners: Tensor, chunk: int) -> tuple[Tensor, Tensor]:
     """(triangle [N], the first of several; barycentric coordinates [N, 3]) of points [N, 3] on triangles [F, 3, 3].
 
     By the engine's library, where that is at hand; ``chunk``: pairs per pass, where torch searches.
@@ -62,7 +62,7 @@ def _near(points: Tensor, corners: Tensor) -> tuple[Tensor, Tensor]:
     """Pairs (point [M], triangle [M]), by points, that leave out only triangles beyond another's farthest place."""
     centre = corners.mean(1)
     radius = (corners - centre[:, None]).norm(dim=-1).amax(1)
-    distance = torch.cdist(points, centre, compute_mode=EXACT)
+    distance = torch.cdist(points, centre, compute_mode=EXACT_CDIST_MODE)
     slack = 1 + 16 * torch.finfo(points.dtype).eps
     reach = slack * (distance + radius).amin(1, keepdim=True)
     point, triangle = (distance - radius <= reach).nonzero(as_tuple=True)

@@ -9,15 +9,15 @@ from torch import Tensor
 from ..errors import InvalidInput
 
 
-def taken(given: Tensor | np.ndarray) -> Tensor:
+def as_tensor(given: Tensor | np.ndarray) -> Tensor:
     """As it is, or an array of recordings and meshes as a tensor."""
     return given if isinstance(given, Tensor) else torch.as_tensor(given)
 
 
-def check_places(places: Tensor, name: str, least: int = 0) -> None:
+def check_points(places: Tensor, name: str, min_count: int = 0) -> None:
     """Refuse what is not [N, 3] real numbers with N >= least."""
-    if places.ndim != 2 or places.shape[1] != 3 or len(places) < least:
-        expected = "[N, 3] in metres" + (f", N >= {least}" if least else "")
+    if places.ndim != 2 or places.shape[1] != 3 or len(places) < min_count:
+        expected = "[N, 3] in metres" + (f", N >= {min_count}" if min_count else "")
         raise InvalidInput(name, got=f"shape {tuple(places.shape)}", expected=expected, remedy="pass one frame at once")
     if not places.is_floating_point():
         raise InvalidInput(name, got=str(places.dtype).removeprefix("torch."), expected="real numbers, in metres")

@@ -7,28 +7,28 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from .._utils.caching import Remembered
+from .._utils.caching import VersionedTensorCache
 from .._utils.linalg import cross, dot, safe_norm
-from .._utils.torch_modes import undisturbed
-from .nearest import nearest
-from .shapes import check_places, check_triangles, taken
+from .._utils.torch_modes import disable_autocast
+from .nearest import find_nearest_triangles
+from .shapes import check_points, check_triangles, as_tensor
 
 
-class Hits(NamedTuple):
+class ClosestPoints(NamedTuple):
     """Closest surface points of N measured points; held constant while differentiating (envelope theorem)."""
 
     corners: Tensor  # [N, 3] int64, vertices of the triangle that was hit
     weights: Tensor  # [N, 3] -, barycentric coordinates
-    beyond: Tensor  # [N] bool, the point lies beyond the sheet's edge
+    is_beyond_edge: Tensor  # [N] bool, the point lies beyond the sheet's edge
 
-    def on(self, vertices: Tensor) -> Tensor:
+    def interpolate(self, vertices: Tensor) -> Tensor:
         """[..., N, 3] m, the material points that were hit, on vertices [..., V, 3]."""
         picked = vertices.index_select(-2, self.corners.reshape(-1)).unflatten(-2, (-1, 3))
         return (self.weights.unsqueeze(-1) * picked).sum(-2)
 
 
-@undisturbed()
-def closest(points: Tensor, vertices: Tensor, faces: Tensor, chunk: int = 4_000_000) -> Hits:
+@disable_autocast()
+def find_closest_points(points: Tensor, vertices: Tensor, faces: Tensor, chunk: int = 4_000_000) -> ClosestPoints:
     """Exact closest points on a triangle mesh.
 
     Args:
@@ -40,32 +40,32 @@ def closest(points: Tensor, vertices: Tensor, faces: Tensor, chunk: int = 4_000_
     Raises:
         InvalidInput: other shapes, no faces, indices of no vertex, two precisions, or numbers that are not finite.
     """
-    points, vertices, faces = taken(points), taken(vertices), taken(faces)
-    check_places(points, "points")
-    check_places(vertices, "vertices")
+    points, vertices, faces = as_tensor(points), as_tensor(vertices), as_tensor(faces)
+    check_points(points, "points")
+    check_points(vertices, "vertices")
     check_triangles(faces, len(vertices))
     with torch.no_grad():
         points, vertices = points.detach(), vertices.detach()
-        face, weights = nearest(points, vertices[faces], chunk)
-        return Hits(faces[face], weights, _on_boundary(faces, face, weights))
+        face, weights = find_nearest_triangles(points, vertices[faces], chunk)
+        return ClosestPoints(faces[face], weights, _on_boundary(faces, face, weights))
 
 
-def residuals(points: Tensor, vertices: Tensor, hits: Hits) -> tuple[Tensor, Tensor]:
+def residuals(points: Tensor, vertices: Tensor, closest_points: ClosestPoints) -> tuple[Tensor, Tensor]:
     """Signed distances [m] of points from the surface, split by direction.
 
     Returns:
         (along the normal [N], for every point; in the surface's plane [N], for points beyond the sheet's edge and 0
         elsewhere: points beyond pull the edge outwards, missing points do not pull it back, occlusion explains them)
     """
-    points, vertices = taken(points), taken(vertices)
-    x0, x1, x2 = vertices.index_select(-2, hits.corners.reshape(-1)).unflatten(-2, (-1, 3)).unbind(-2)
+    points, vertices = as_tensor(points), as_tensor(vertices)
+    x0, x1, x2 = vertices.index_select(-2, closest_points.corners.reshape(-1)).unflatten(-2, (-1, 3)).unbind(-2)
     normal = cross(x1 - x0, x2 - x0)
     size = safe_norm(normal)
     normal = normal / torch.where(size > 0, size, 1.0)  # a triangle without area has none
-    offset = points - hits.on(vertices)
+    offset = points - closest_points.interpolate(vertices)
     along = dot(normal, offset)
     beside = offset - along * normal
-    beside = safe_norm(torch.where(hits.beyond.unsqueeze(-1), beside, torch.zeros_like(beside)))
+    beside = safe_norm(torch.where(closest_points.is_beyond_edge.unsqueeze(-1), beside, torch.zeros_like(beside)))
     return along.squeeze(-1), beside.squeeze(-1)
 
 
@@ -78,14 +78,14 @@ def chamfer_to_surface(points: Tensor, vertices: Tensor, faces: Tensor) -> Tenso
     Raises:
         InvalidInput: as `closest`, or no points, which have no mean.
     """
-    points, vertices = taken(points), taken(vertices)
-    check_places(points, "points", least=1)
-    return distances(points, vertices, closest(points, vertices, faces)).mean()
+    points, vertices = as_tensor(points), as_tensor(vertices)
+    check_points(points, "points", min_count=1)
+    return point_distances(points, vertices, find_closest_points(points, vertices, faces)).mean()
 
 
-def distances(points: Tensor, vertices: Tensor, hits: Hits) -> Tensor:
+def point_distances(points: Tensor, vertices: Tensor, closest_points: ClosestPoints) -> Tensor:
     """[N] m, of points from the places that they hit; differentiable in ``vertices``."""
-    return safe_norm(taken(points) - hits.on(taken(vertices))).squeeze(-1)
+    return safe_norm(as_tensor(points) - closest_points.interpolate(as_tensor(vertices))).squeeze(-1)
 
 
 def _on_boundary(faces: Tensor, face: Tensor, weights: Tensor) -> Tensor:
@@ -97,10 +97,10 @@ def _on_boundary(faces: Tensor, face: Tensor, weights: Tensor) -> Tensor:
 
 def _boundary(faces: Tensor) -> tuple[Tensor, Tensor]:
     """([F, 3] bool, whether the edge opposite to each corner is open; [V] bool, whether a vertex is an end of one)."""
-    return _KNOWN.of(faces, lambda: _find_boundary(faces))
+    return _MESH_BOUNDARIES.get_or_compute(faces, lambda: _find_boundary(faces))
 
 
-_KNOWN: Remembered[tuple[Tensor, Tensor]] = Remembered()
+_MESH_BOUNDARIES: VersionedTensorCache[tuple[Tensor, Tensor]] = VersionedTensorCache()
 
 
 def _find_boundary(faces: Tensor) -> tuple[Tensor, Tensor]:

@@ -5,11 +5,11 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from .._utils.linalg import EXACT
+from .._utils.linalg import EXACT_CDIST_MODE
 from ..errors import InvalidInput
-from .shapes import check_places, taken
+from .shapes import check_points, as_tensor
 
-AT_A_TIME = 4_000_000  # distances
+MAX_DISTANCES_PER_BLOCK = 4_000_000  # distances
 
 
 def chamfer_to_vertices(points: Tensor, vertices: Tensor) -> Tensor:
@@ -24,13 +24,13 @@ def chamfer_to_vertices(points: Tensor, vertices: Tensor) -> Tensor:
     Raises:
         InvalidInput: other shapes, or none of either.
     """
-    points, vertices = taken(points), taken(vertices)
-    check_places(points, "points", least=1)
-    check_places(vertices, "vertices", least=1)
+    points, vertices = as_tensor(points), as_tensor(vertices)
+    check_points(points, "points", min_count=1)
+    check_points(vertices, "vertices", min_count=1)
     if points.dtype != vertices.dtype:
         raise InvalidInput("points", got=points.dtype, expected=f"the vertices' precision, {vertices.dtype}")
     with torch.no_grad():
         # by products of the coordinates, distances would lose their digits far from the origin
-        some = points.split(max(1, AT_A_TIME // len(vertices)))
-        nearest = torch.cat([torch.cdist(part, vertices, compute_mode=EXACT).argmin(-1) for part in some])
+        some = points.split(max(1, MAX_DISTANCES_PER_BLOCK // len(vertices)))
+        nearest = torch.cat([torch.cdist(part, vertices, compute_mode=EXACT_CDIST_MODE).argmin(-1) for part in some])
     return (points - vertices[nearest]).norm(dim=-1).mean()

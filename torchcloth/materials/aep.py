@@ -67,7 +67,7 @@ class AEP(DirectorMaterial):
             raise InvalidInput("convention", got=repr(convention), expected='"plane_stress" or "paper"')
         self.youngs_modulus = PhysicalParameter(youngs_modulus, "Pa", name="youngs_modulus")
         self.poisson_ratio = PhysicalParameter(poisson_ratio, "-", "unit_half", name="poisson_ratio")
-        self._complete(contact_stiffness, shear_stiffness, cone, plastic)
+        self._add_director_parameters(contact_stiffness, shear_stiffness, cone, plastic)
         self.convention = convention
 
     @classmethod
@@ -80,9 +80,9 @@ class AEP(DirectorMaterial):
         Raises:
             InvalidInput: no such fabric, or one whose membrane stiffness was not published or is not isotropic.
         """
-        from .presets import find
+        from .presets import find_fabric
 
-        return cls(**find(name).isotropic(**changes))
+        return cls(**find_fabric(name).isotropic(**changes))
 
     @property
     def membrane_stiffness(self) -> Tensor:
@@ -94,7 +94,7 @@ class AEP(DirectorMaterial):
         paper = self.convention == "paper"
         youngs, nu = self.youngs_modulus.field * self.thickness, self.poisson_ratio.field
         lam = youngs * nu / ((1 + nu) * (1 - 2 * nu)) if paper else youngs * nu / (1 - nu * nu)
-        director = self._director()
+        director = self._director_coefficients()
         if paper:
             director["shear"] = 2 * director["shear"]
         return Coefficients(mu=youngs / (2 * (1 + nu)), lam=lam, **director)

@@ -69,14 +69,14 @@ class AbstractMaterial(nn.Module, ABC):
     def return_map(self, c: Any, n: Tensor, d3: Tensor) -> Tensor:
         """The elastic director after plastic flow, [..., E, S, 3]; idempotent."""
 
-    def start(self, triangles: int) -> Tensor | None:
+    def initial_memory(self, triangles: int) -> Tensor | None:
         """Inelastic part A of a virgin sheet's deformation [E, 4] = (A11, A12, A21, A22); None: always elastic.
 
         The membrane law is given the elastic deformation F_E = F A, A the inverse of the plastic set.
         """
         return None
 
-    def flow(self, c: Any, elastic: Surface, inelastic: Tensor) -> Tensor:
+    def flow(self, c: Any, trial: Surface, inverse_plastic: Tensor) -> Tensor:
         """The inelastic part [..., E, 4] after plastic flow; idempotent.
 
         ``elastic`` is the deformation F A that would be elastic if nothing flowed.

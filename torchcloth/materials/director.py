@@ -38,7 +38,7 @@ class DirectorMaterial(AbstractMaterial, ABC):
             raise InvalidInput("thickness", got=f"{thickness!r:.40} m", expected="a value > 0")
         self.plastic: NormYield | None = None
 
-    def _complete(
+    def _add_director_parameters(
         self,
         contact_stiffness: float | Tensor,
         shear_stiffness: float | Tensor,
@@ -55,7 +55,7 @@ class DirectorMaterial(AbstractMaterial, ABC):
             )
         self.plastic = plastic
 
-    def _director(self) -> dict[str, Tensor]:
+    def _director_coefficients(self) -> dict[str, Tensor]:
         """k h and gamma h [N/m], c_F, and the limit of elastic stretch (infinite without plasticity)."""
         cone = self.cone.field
         return {
@@ -90,13 +90,13 @@ class DirectorMaterial(AbstractMaterial, ABC):
         keep = torch.where(slips, limit / torch.where(slips, friction, 1.0), 1.0)
         return torch.where(height > 1, n, keep * r + height * n)
 
-    def start(self, triangles: int) -> Tensor | None:
+    def initial_memory(self, triangles: int) -> Tensor | None:
         """No plastic set yet."""
-        return None if self.plastic is None else self.plastic.start(triangles)
+        return None if self.plastic is None else self.plastic.initial_memory(triangles)
 
-    def flow(self, c: Any, elastic: Surface, inelastic: Tensor) -> Tensor:
+    def flow(self, c: Any, trial: Surface, inverse_plastic: Tensor) -> Tensor:
         """The plastic law's."""
-        return inelastic if self.plastic is None else self.plastic.flow(c.limit, elastic, inelastic)
+        return inverse_plastic if self.plastic is None else self.plastic.flow(c.limit, trial, inverse_plastic)
 
     def extra_repr(self) -> str:
         """Constants of the data sheet."""

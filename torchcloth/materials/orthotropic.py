@@ -63,7 +63,7 @@ class WovenMaterial(DirectorMaterial, ABC):
         """Yarns have directions, also where both are alike."""
         return True
 
-    def _woven(self, warp: Tensor, weft: Tensor, mu: Tensor, nu: Tensor, c1: Tensor, c2: Tensor) -> Coefficients:
+    def _woven_coefficients(self, warp: Tensor, weft: Tensor, mu: Tensor, nu: Tensor, c1: Tensor, c2: Tensor) -> Coefficients:
         """Of moduli times thickness [N/m], and the stiffening of warp and weft [-]."""
         return Coefficients(
             mu=mu,
@@ -73,7 +73,7 @@ class WovenMaterial(DirectorMaterial, ABC):
             weft=weft / (1 + nu) - 2 * mu,
             warp_toe=warp * c1,
             weft_toe=weft * c2,
-            **self._director(),
+            **self._director_coefficients(),
         )
 
     def membrane_energy(self, c: Coefficients, surface: Surface) -> Tensor:
@@ -155,7 +155,7 @@ class OrthotropicAEP(WovenMaterial):
         self.poisson_ratio = PhysicalParameter(poisson_ratio, "-", "unit_half", name="poisson_ratio")
         self.warp_stiffening = PhysicalParameter(warp_stiffening, "-", "nonnegative", name="warp_stiffening")
         self.weft_stiffening = PhysicalParameter(weft_stiffening, "-", "nonnegative", name="weft_stiffening")
-        self._complete(contact_stiffness, shear_stiffness, cone, plastic)
+        self._add_director_parameters(contact_stiffness, shear_stiffness, cone, plastic)
 
     @classmethod
     def preset(cls, name: str, **changes) -> OrthotropicAEP:
@@ -164,15 +164,15 @@ class OrthotropicAEP(WovenMaterial):
         Raises:
             InvalidInput: no such fabric, or one without published stiffness in warp, weft or shear.
         """
-        from .presets import find
+        from .presets import find_fabric
 
-        return cls(**find(name).orthotropic(**changes))
+        return cls(**find_fabric(name).orthotropic(**changes))
 
     def coefficients(self) -> Coefficients:
         """Stiffnesses times thickness."""
         warp, weft = self.youngs_modulus.field * self.thickness, self.weft_modulus.field * self.thickness
         mu, nu = self.shear_modulus.field * self.thickness, self.poisson_ratio.field
-        return self._woven(warp, weft, mu, nu, self.warp_stiffening.field, self.weft_stiffening.field)
+        return self._woven_coefficients(warp, weft, mu, nu, self.warp_stiffening.field, self.weft_stiffening.field)
 
 
 class StiffeningAEP(WovenMaterial):
@@ -204,13 +204,13 @@ class StiffeningAEP(WovenMaterial):
         self.youngs_modulus = PhysicalParameter(youngs_modulus, "Pa", name="youngs_modulus")
         self.poisson_ratio = PhysicalParameter(poisson_ratio, "-", "unit_half", name="poisson_ratio")
         self.stiffening = PhysicalParameter(stiffening, "-", "nonnegative", name="stiffening")
-        self._complete(contact_stiffness, shear_stiffness, cone, plastic)
+        self._add_director_parameters(contact_stiffness, shear_stiffness, cone, plastic)
 
     def coefficients(self) -> Coefficients:
         """Stiffnesses times thickness."""
         modulus, nu = self.youngs_modulus.field * self.thickness, self.poisson_ratio.field
         c = self.stiffening.field
-        return self._woven(modulus, modulus, modulus / (2 * (1 + nu)), nu, c, c)
+        return self._woven_coefficients(modulus, modulus, modulus / (2 * (1 + nu)), nu, c, c)
 
 
 def _dilation(c: Coefficients, surface: Surface, warp: Tensor, weft: Tensor) -> Tensor:

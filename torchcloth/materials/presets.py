@@ -17,7 +17,7 @@ from ..errors import InvalidInput
 
 _Numbers = dict[str, float | None]
 
-NOMINAL = 1e-3  # m, thickness where none is published: stands in E = Y / h and drops out of every force
+NOMINAL_THICKNESS_M = 1e-3  # m, thickness where none is published: stands in E = Y / h and drops out of every force
 
 
 class Fabric(NamedTuple):
@@ -85,7 +85,7 @@ class Fabric(NamedTuple):
     def _arguments(
         self, resultants: _Numbers, poisson: float | None, needed: list[str], changes: dict[str, Any]
     ) -> dict[str, Any]:
-        thickness = changes.get("thickness", self.thickness or NOMINAL)
+        thickness = changes.get("thickness", self.thickness or NOMINAL_THICKNESS_M)
         if not thickness > 0:
             raise InvalidInput("thickness", got=f"{thickness} m", expected="a value > 0")
         given: dict[str, Any] = {"thickness": thickness}
@@ -118,7 +118,7 @@ _TEXT = ("name", "fabric", "structure", "grade", "source", "note")
 
 
 @cache
-def fabrics() -> dict[str, Fabric]:
+def load_fabrics() -> dict[str, Fabric]:
     """All rows by name, in the order of the table."""
     text = resources.files("torchcloth.materials").joinpath("fabrics.csv").read_text(encoding="utf-8")
     _, *rows = csv.reader(text.splitlines())
@@ -130,18 +130,18 @@ def fabrics() -> dict[str, Fabric]:
     return found
 
 
-def find(name: str) -> Fabric:
+def find_fabric(name: str) -> Fabric:
     """The fabric called ``name``.
 
     Raises:
         InvalidInput: no such fabric.
     """
-    if name not in fabrics():
-        raise InvalidInput("fabric", got=repr(name), expected=f"one of {', '.join(fabrics())}")
-    return fabrics()[name]
+    if name not in load_fabrics():
+        raise InvalidInput("fabric", got=repr(name), expected=f"one of {', '.join(load_fabrics())}")
+    return load_fabrics()[name]
 
 
-def table() -> str:
+def format_table() -> str:
     """The numbers of all fabrics as text, with their grade; sources by ``find(name).source``."""
     columns = {
         "kg/m2": "areal_density",
@@ -156,7 +156,7 @@ def table() -> str:
         "mu": "friction",
     }
     lines = [["name", "fabric", *columns, "grade"]]
-    for f in fabrics().values():
+    for f in load_fabrics().values():
         lines.append([f.name, f.fabric[:28], *(_shown(getattr(f, key)) for key in columns.values()), f.grade])
     widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
     return "\n".join("  ".join(c.ljust(w) for c, w in zip(line, widths, strict=True)).rstrip() for line in lines)

@@ -30,13 +30,13 @@ class NormYield(nn.Module):
         super().__init__()
         self.limit = PhysicalParameter(limit, "-", name="yield limit")
 
-    def start(self, triangles: int) -> Tensor:
+    def initial_memory(self, triangles: int) -> Tensor:
         """No set: the identity, by rows [E, 4]."""
         return torch.eye(2).flatten().expand(triangles, 4)
 
-    def flow(self, limit: Tensor, elastic: Surface, inelastic: Tensor) -> Tensor:
+    def flow(self, limit: Tensor, trial: Surface, inverse_plastic: Tensor) -> Tensor:
         """A -> A U^-1 (1 + c (U - 1) / |U - 1|) where |U - 1| > c, U the elastic stretch; [..., E, 4] by rows."""
-        u = right_stretch(elastic)
+        u = right_stretch(trial)
         strain = torch.cat([u.warp - 1, u.shear, u.shear, u.weft - 1], dim=-1)
         length = safe_norm(strain)
         yields = length > limit
@@ -44,6 +44,6 @@ class NormYield(nn.Module):
         # U^-1 (1 + keep (U - 1)) = keep + (1 - keep) U^-1, with U^-1 = adj U / J
         adjugate = torch.cat([u.weft, -u.shear, -u.shear, u.warp], dim=-1)
         one = torch.eye(2, dtype=strain.dtype, device=strain.device).flatten()
-        change = (1 - keep) / elastic.J * adjugate + keep * one
-        set_now = (inelastic.unflatten(-1, (2, 2)) @ change.unflatten(-1, (2, 2))).flatten(-2)
-        return torch.where(yields, set_now, inelastic)
+        change = (1 - keep) / trial.J * adjugate + keep * one
+        set_now = (inverse_plastic.unflatten(-1, (2, 2)) @ change.unflatten(-1, (2, 2))).flatten(-2)
+        return torch.where(yields, set_now, inverse_plastic)

@@ -14,8 +14,8 @@ from ..errors import InvalidInput
 from .mesh import Mesh
 from .sewing import Curve, Drawing, Kind, Piece, sew
 
-GARMENT_TRIANGLES = 1500
-GAP = 0.010  # m
+DEFAULT_GARMENT_TRIANGLES = 1500
+LAYER_GAP_M = 0.010  # m
 
 
 def shirt(
@@ -31,8 +31,8 @@ def shirt(
     sleeve: float = 0.24,
     sleeve_angle: float = 0.6,
     cuff: float = 0.18,
-    triangles: int = GARMENT_TRIANGLES,
-    gap: float = GAP,
+    triangles: int = DEFAULT_GARMENT_TRIANGLES,
+    gap: float = LAYER_GAP_M,
 ) -> Mesh:
     """A T-shirt; with a longer ``sleeve`` a sweatshirt. Openings: neck, hem, left and right cuff.
 
@@ -95,8 +95,8 @@ def trousers(
     rise: float = 0.28,
     hem: float = 0.21,
     spread: float = 0.05,
-    triangles: int = GARMENT_TRIANGLES,
-    gap: float = GAP,
+    triangles: int = DEFAULT_GARMENT_TRIANGLES,
+    gap: float = LAYER_GAP_M,
 ) -> Mesh:
     """Long trousers; with a shorter ``length`` shorts. Openings: waist, left and right hem.
 
@@ -145,8 +145,8 @@ def dress(
     neck_depth: float = 0.12,
     armhole: float = 0.22,
     waist_height: float = 0.43,
-    triangles: int = GARMENT_TRIANGLES,
-    gap: float = GAP,
+    triangles: int = DEFAULT_GARMENT_TRIANGLES,
+    gap: float = LAYER_GAP_M,
 ) -> Mesh:
     """A sleeveless dress: bodice and flared skirt, sewn at the waist. Openings: neck, hem, left and right armhole.
 

@@ -11,12 +11,12 @@ from numpy.typing import ArrayLike
 from ..errors import InvalidInput
 from . import topology
 
-SAME = 1e-6  # of the largest extent: vertices that near lie in one place
-UNEVEN = 1.5  # times the mean edge, beyond which a longest edge is not that of an even mesh: ours have 1.24 to 1.46
-UNLIKE, TEXTURE = 1.2, 1.05  # times an edge that lies there, beyond which a pattern's is in another unit
-FEW = 0.1  # of the edges, that may be longer or shorter: gathered or stretched where the cloth lies
-LARGEST = 20.0  # m, of a cloth; the same number in millimetres is a handkerchief
-HEAVIEST = 20.0  # kg/m^2, of a cloth; the same number in g/m^2 is a veil
+COINCIDENT_VERTEX_FRACTION = 1e-6  # of the largest extent: vertices that near lie in one place
+MAX_EVEN_EDGE_RATIO = 1.5  # times the mean edge, beyond which a longest edge is not that of an even mesh: ours have 1.24 to 1.46
+MAX_PATTERN_EDGE_RATIO, MAX_UNIT_SQUARE_EDGE_RATIO = 1.2, 1.05  # times an edge that lies there, beyond which a pattern's is in another unit
+IGNORED_EDGE_FRACTION = 0.1  # of the edges, that may be longer or shorter: gathered or stretched where the cloth lies
+MAX_CLOTH_SPAN_M = 20.0  # m, of a cloth; the same number in millimetres is a handkerchief
+MAX_AREAL_DENSITY_KG_PER_M2 = 20.0  # kg/m^2, of a cloth; the same number in g/m^2 is a veil
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,7 +74,7 @@ class Mesh:
         named = {name: _check_place(name, np.array(index), len(x)) for name, index in (places or {}).items()}
         return Mesh(x, f, rest, pattern, named)
 
-    def same(self, other: Mesh) -> bool:
+    def is_equal(self, other: Mesh) -> bool:
         """Whether vertices, triangles, rest shapes, patterns and places are the same."""
         if self is other:
             return True
@@ -89,41 +89,41 @@ class Mesh:
     @property
     def uv(self) -> np.ndarray | None:
         """[V, 2] m, pattern coordinates of the vertices; None without a pattern, or where a seam gives a vertex two."""
-        return None if self.pattern is None else per_vertex(self.faces, self.pattern)
+        return None if self.pattern is None else corner_to_vertex_values(self.faces, self.pattern)
 
     @property
     def seams(self) -> np.ndarray:
         """[N, 2] int64, edges along which panels are sewn; empty without a pattern."""
-        return np.zeros((0, 2), np.int64) if self.pattern is None else topology.seams(self.faces, self.pattern)
+        return np.zeros((0, 2), np.int64) if self.pattern is None else topology.find_seams(self.faces, self.pattern)
 
     @property
     def boundary_edges(self) -> np.ndarray:
         """[N, 2] int64, free edges (hems): those of one triangle only."""
-        edges, triangles = topology.edges(self.faces)
+        edges, triangles = topology.find_edges(self.faces)
         return edges[triangles == 1]
 
     @property
     def panels(self) -> np.ndarray:
         """[F] int64, the number of each triangle's panel: pieces that were one before sewing; 0 without a pattern."""
         return (
-            np.zeros(len(self.faces), np.int64) if self.pattern is None else topology.panels(self.faces, self.pattern)
+            np.zeros(len(self.faces), np.int64) if self.pattern is None else topology.number_panels(self.faces, self.pattern)
         )
 
     @property
-    def pieces(self) -> int:
+    def piece_count(self) -> int:
         """How many parts have no vertex in common."""
-        return topology.pieces(self.faces)
+        return topology.count_pieces(self.faces)
 
     @property
-    def torn(self) -> int:
+    def duplicated_vertex_count(self) -> int:
         """How many vertices lie where one of another piece does, as where a file splits them by texture coordinates."""
-        own = topology.piece_of(self.faces)
+        own = topology.number_pieces(self.faces)
         if own.max(initial=0) == 0:
             return 0
         used = np.unique(self.faces)
         span = np.ptp(self.vertices, axis=0).max()
         _, place = np.unique(
-            np.round(self.vertices[used] / (SAME * span)).astype(np.int64), axis=0, return_inverse=True
+            np.round(self.vertices[used] / (COINCIDENT_VERTEX_FRACTION * span)).astype(np.int64), axis=0, return_inverse=True
         )
         place = place.reshape(-1)
         pairs = np.unique(np.column_stack([place, own[used]]), axis=0)
@@ -156,7 +156,7 @@ class Mesh:
     def coarse_edge(self) -> float:
         """Mean edge length [m], or where triangles differ much 2/3 of the longest edge: what points are laid by."""
         sides = np.linalg.norm(self.rest - np.roll(self.rest, 1, axis=1), axis=-1)
-        return float(max(sides.mean(), sides.max() / UNEVEN))
+        return float(max(sides.mean(), sides.max() / MAX_EVEN_EDGE_RATIO))
 
     @property
     def extent(self) -> float:
@@ -164,11 +164,11 @@ class Mesh:
 
         So far the cloth can extend in any state without strain, up to the zigzag of the edges.
         """
-        firsts = topology.firsts(self.faces)
-        starts = (topology.farthest(self.faces, self.rest, int(first))[0] for first in firsts)
-        return max(topology.farthest(self.faces, self.rest, start)[1] for start in starts)
+        firsts = topology.find_first_vertices(self.faces)
+        starts = (topology.find_farthest_vertex(self.faces, self.rest, int(first))[0] for first in firsts)
+        return max(topology.find_farthest_vertex(self.faces, self.rest, start)[1] for start in starts)
 
-    def in_order(self) -> Mesh:
+    def renumber_along_longest_side(self) -> Mesh:
         """The same cloth with vertices and triangles numbered along its longest side.
 
         Threads share a cloth by numbers: where they share few places too, they wait less for each other.
@@ -184,7 +184,7 @@ class Mesh:
             {name: np.sort(number[index]) for name, index in self.places.items()},
         )
 
-    def nearest_vertices(self, uv: ArrayLike, radius: float) -> np.ndarray:
+    def vertices_near_pattern_points(self, uv: ArrayLike, radius: float) -> np.ndarray:
         """Indices of the vertices within ``radius`` [m] of any of the pattern points ``uv`` [G, 2].
 
         Raises:
@@ -211,7 +211,7 @@ class Mesh:
             )
         return found
 
-    def around(self, place: str, radius: float = 0.0) -> np.ndarray:
+    def vertices_at_place(self, place: str, radius: float = 0.0) -> np.ndarray:
         """Indices of the vertices of a named place, and of those within ``radius`` [m] of it in ``vertices``.
 
         The radius reaches through layers that lie on each other, as a gripper that pinches them does.
@@ -246,15 +246,15 @@ def check_metres(vertices: np.ndarray, faces: np.ndarray, corners: np.ndarray | 
     unless by chance: a pattern that fills the unit square must fit more closely.
     """
     span = float(np.ptp(vertices, axis=0).max())
-    if span > LARGEST:
+    if span > MAX_CLOTH_SPAN_M:
         got, remedy = f"a span of {span:.4g}", "multiply by 0.001"
         raise InvalidInput(f"{place} looks like millimetres", got=got, expected="metres", remedy=remedy)
     if corners is None:
         return
     pattern, lying = (np.linalg.norm(c - np.roll(c, 1, axis=1), axis=-1).ravel() for c in (corners, vertices[faces]))
-    low, high = np.quantile(pattern / np.maximum(lying, 1e-9 * span), (FEW, 1 - FEW))
+    low, high = np.quantile(pattern / np.maximum(lying, 1e-9 * span), (IGNORED_EDGE_FRACTION, 1 - IGNORED_EDGE_FRACTION))
     square = np.allclose([corners.min((0, 1)), corners.max((0, 1))], [[0, 0], [1, 1]], rtol=0, atol=1e-3)
-    limit = TEXTURE if square else UNLIKE
+    limit = MAX_UNIT_SQUARE_EDGE_RATIO if square else MAX_PATTERN_EDGE_RATIO
     if not 1 / limit < low <= high < limit:
         raise InvalidInput(
             f"{place}: vt",
@@ -264,7 +264,7 @@ def check_metres(vertices: np.ndarray, faces: np.ndarray, corners: np.ndarray | 
         )
 
 
-def per_vertex(faces: np.ndarray, corners: np.ndarray) -> np.ndarray | None:
+def corner_to_vertex_values(faces: np.ndarray, corners: np.ndarray) -> np.ndarray | None:
     """[V, D] from the values [F, 3, D] of triangles' corners, or None where a vertex has several."""
     values = np.zeros((faces.max() + 1, corners.shape[-1]))
     values[faces] = corners
@@ -311,7 +311,7 @@ def _check_triangles(x: np.ndarray, f: np.ndarray) -> None:
 
 
 def _check_winding(f: np.ndarray) -> None:
-    bad = topology.unlike(f)
+    bad = topology.find_inconsistent_sides(f)
     if len(bad):
         raise InvalidInput(
             "faces",
@@ -344,7 +344,7 @@ def _turned_over(faces: np.ndarray, pattern: np.ndarray) -> np.ndarray:
     area = signed_area(pattern)
     if (area > 0).all():
         return pattern
-    panel = topology.panels(faces, pattern)
+    panel = topology.number_panels(faces, pattern)
     behind = np.bincount(panel, area >= 0) == 0
     return np.where(behind[panel][:, None, None], pattern * np.array([-1.0, 1.0]), pattern)
 

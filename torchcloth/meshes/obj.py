@@ -8,7 +8,7 @@ import numpy as np
 
 from ..errors import InvalidInput
 
-WIDTH = {"v": 3, "vt": 2}  # numbers that are read; more may follow
+VALUES_PER_LINE_KIND = {"v": 3, "vt": 2}  # numbers that are read; more may follow
 
 
 def parse(text: str, place: str) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
@@ -25,12 +25,12 @@ def parse(text: str, place: str) -> tuple[np.ndarray, np.ndarray, np.ndarray | N
     for number, line in enumerate(text.splitlines(), 1):
         word, *items = line.split("#")[0].split() or [""]
         try:
-            if word in ("v", "vt") and len(items) < WIDTH[word]:
+            if word in ("v", "vt") and len(items) < VALUES_PER_LINE_KIND[word]:
                 raise ValueError(f"{len(items)} numbers")
             if word == "v":
-                v.append([float(x) for x in items[: WIDTH[word]]])
+                v.append([float(x) for x in items[: VALUES_PER_LINE_KIND[word]]])
             elif word == "vt":
-                vt.append([float(x) for x in items[: WIDTH[word]]])
+                vt.append([float(x) for x in items[: VALUES_PER_LINE_KIND[word]]])
             elif word == "f":
                 ring = [_corner(item, len(v), len(vt)) for item in items]
                 if len(ring) > 3:

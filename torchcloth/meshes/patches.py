@@ -15,11 +15,11 @@ import numpy as np
 from . import topology
 from .mesh import Mesh, signed_area
 
-MOST = 0.65  # of an edge that crosses the patch's, the farthest that one of its ends moves
-INNER = 0.5  # radii, from the centre, within which nothing is moved onto the edge
-REACH = 2.0  # edges, and one radius at least, over which others make room
-STRAIGHT = 0.03  # 1 - cos of the turn at a vertex of the rim along which it may go: 14 degrees
-SQUEEZED = 0.25  # of a triangle's area, the least that may be left
+MAX_EDGE_MOVE_FRACTION = 0.65  # of an edge that crosses the patch's, the farthest that one of its ends moves
+MIN_MOVED_DISTANCE_RADII = 0.5  # radii, from the centre, within which nothing is moved onto the edge
+SMOOTHING_REACH_EDGES = 2.0  # edges, and one radius at least, over which others make room
+MAX_STRAIGHT_RIM_TURN = 0.03  # 1 - cos of the turn at a vertex of the rim along which it may go: 14 degrees
+MIN_LEFT_AREA_FRACTION = 0.25  # of a triangle's area, the least that may be left
 
 
 class Patch(NamedTuple):
@@ -28,25 +28,25 @@ class Patch(NamedTuple):
     centres: np.ndarray
     radius: float
 
-    def offset(self, uv: np.ndarray) -> np.ndarray:
+    def offset_from_centre(self, uv: np.ndarray) -> np.ndarray:
         """[N, 2] m, of pattern points from the nearest centre."""
         away = uv[:, None] - self.centres
         return away[np.arange(len(uv)), np.linalg.norm(away, axis=-1).argmin(1)]
 
-    def ends_on(self, uv: np.ndarray) -> bool:
+    def has_vertices_on_edge(self, uv: np.ndarray) -> bool:
         """Whether some of the vertices [V, 2] m are on its edge; else the mesh is too coarse, or not made for it."""
-        far = np.linalg.norm(self.offset(uv), axis=1)
+        far = np.linalg.norm(self.offset_from_centre(uv), axis=1)
         return bool((np.abs(far - self.radius) <= 1e-6 * self.radius).any())
 
 
-def fitted_to(mesh: Mesh, patches: Sequence[Patch]) -> np.ndarray:
+def fit_to_patches(mesh: Mesh, patches: Sequence[Patch]) -> np.ndarray:
     """[V, 2] m, pattern coordinates by which no edge of a triangle crosses a patch's; the rim of the cloth stays.
 
     The mesh needs ``uv``. Where an end of the edge would have to go too far, or a triangle were squeezed too much,
     vertices stay where they are.
     """
     uv: np.ndarray = mesh.uv  # type: ignore[assignment]
-    free = along_rim(mesh, uv)
+    free = project_along_rim(mesh, uv)
     onto = np.full_like(uv, np.nan)
     for patch in patches:
         found = _onto(patch, uv, free, mesh.faces)
@@ -56,7 +56,7 @@ def fitted_to(mesh: Mesh, patches: Sequence[Patch]) -> np.ndarray:
         placed = uv + np.einsum("vij,vj->vi", free, _around(uv, onto, patches, mesh.mean_edge))
         moved = ~np.isnan(onto[:, 0])
         placed[moved] = uv[moved] + onto[moved]
-        bad = np.unique(mesh.faces[signed_area(placed[mesh.faces]) < SQUEEZED * before])
+        bad = np.unique(mesh.faces[signed_area(placed[mesh.faces]) < MIN_LEFT_AREA_FRACTION * before])
         if not len(bad):
             return placed
         if not moved[bad].any():
@@ -71,16 +71,16 @@ def _onto(patch: Patch, uv: np.ndarray, free: np.ndarray, faces: np.ndarray) -> 
     Of each edge that crosses it one end is enough, that with the shorter way. Three corners of a triangle would leave
     it hardly any area.
     """
-    ends = topology.edges(faces)[0]
-    offset = patch.offset(uv)
+    ends = topology.find_edges(faces)[0]
+    offset = patch.offset_from_centre(uv)
     far = np.linalg.norm(offset, axis=1)
     inside = far <= patch.radius * (1 + 1e-9)
     way = np.einsum("vij,vj->vi", free, offset / np.maximum(far, 1e-12)[:, None])
     way = _reaching(offset, way, patch.radius)
-    way[far < INNER * patch.radius] = np.nan
+    way[far < MIN_MOVED_DISTANCE_RADII * patch.radius] = np.nan
     cost = np.linalg.norm(way, axis=1)
     crossing = ends[inside[ends[:, 0]] != inside[ends[:, 1]]]
-    most = MOST * np.linalg.norm(uv[crossing[:, 0]] - uv[crossing[:, 1]], axis=1) * (1 + 1e-9)
+    most = MAX_EDGE_MOVE_FRACTION * np.linalg.norm(uv[crossing[:, 0]] - uv[crossing[:, 1]], axis=1) * (1 + 1e-9)
     pairs = [(cost[v], v, k) for k, edge in enumerate(crossing) for v in edge if cost[v] <= most[k]]
     on = np.abs(far - patch.radius) <= 1e-9 * patch.radius
     for _, v, k in sorted(pairs):
@@ -108,16 +108,16 @@ def _around(uv: np.ndarray, onto: np.ndarray, patches: Sequence[Patch], edge: fl
     apart = np.linalg.norm(uv[:, None] - uv[moved], axis=-1)
     weight = 1 / np.maximum(apart, 1e-3 * edge) ** 4
     move = weight @ onto[moved] / weight.sum(1, keepdims=True)
-    move *= np.clip(1 - apart.min(1) / max(REACH * edge, *(p.radius for p in patches)), 0.0, 1.0)[:, None]
+    move *= np.clip(1 - apart.min(1) / max(SMOOTHING_REACH_EDGES * edge, *(p.radius for p in patches)), 0.0, 1.0)[:, None]
     for patch in patches:
-        far, after = (np.linalg.norm(patch.offset(p), axis=1) for p in (uv, uv + move))
+        far, after = (np.linalg.norm(patch.offset_from_centre(p), axis=1) for p in (uv, uv + move))
         inside = far <= patch.radius
         move *= np.where(inside, far / patch.radius, 1.0)[:, None]
         move[inside != (after <= patch.radius)] = 0.0
     return move
 
 
-def along_rim(mesh: Mesh, uv: np.ndarray) -> np.ndarray:
+def project_along_rim(mesh: Mesh, uv: np.ndarray) -> np.ndarray:
     """[V, 2, 2] projections of displacements: those of the rim along it, where it turns to nothing; others whole."""
     edges = mesh.boundary_edges
     side = uv[edges[:, 1]] - uv[edges[:, 0]]
@@ -126,4 +126,4 @@ def along_rim(mesh: Mesh, uv: np.ndarray) -> np.ndarray:
     for end in edges.T:
         np.add.at(across, end, normal[:, :, None] * normal[:, None, :])
     size, axes = np.linalg.eigh(across)
-    return np.einsum("vik,vk,vjk->vij", axes, size < STRAIGHT, axes)
+    return np.einsum("vik,vk,vjk->vij", axes, size < MAX_STRAIGHT_RIM_TURN, axes)

@@ -11,11 +11,11 @@ import numpy as np
 from ..errors import InvalidInput
 from . import topology
 from .mesh import Mesh
-from .triangulation import distance_to_path, fill, sample
+from .triangulation import distance_to_path, triangulate_outline, sample_polyline
 
-MARGIN = 0.05  # m between panels on the pattern
-RAMP = 6.0  # gaps over which the layers part from a seam: the placement strains the cloth by 1 / (2 (2 RAMP)^2)
-ATTEMPTS, CLOSE = 8, 0.03  # at the wanted number of triangles
+PANEL_MARGIN_M = 0.05  # m between panels on the pattern
+LIFT_RAMP_GAPS = 6.0  # gaps over which the layers part from a seam: the placement strains the cloth by 1 / (2 (2 RAMP)^2)
+MAX_EDGE_LENGTH_TRIALS, TRIANGLE_COUNT_TOLERANCE = 8, 0.03  # at the wanted number of triangles
 
 Kind = Literal[
     "sewn",  # front to back
@@ -76,13 +76,13 @@ def sew(drawing: Drawing, triangles: int, gap: float) -> Mesh:
         shared[index] |= name in sewn
     behind = np.where(shared, np.arange(len(shared)), len(shared) + np.cumsum(~shared) - 1)
     faces = np.vstack([flat.faces, behind[flat.faces][:, ::-1]])
-    if (topology.edges(faces)[1] > 2).any():
+    if (topology.find_edges(faces)[1] > 2).any():
         raise InvalidInput("triangles", got=triangles, expected="more, for these measures: a part is one triangle wide")
     lift = _lift(flat, sewn, gap)
     front = np.column_stack([flat.points, lift])
     vertices = np.vstack([front, (front * [1.0, 1.0, -1.0])[~shared]])
     vertices[:, :2] -= (vertices[:, :2].min(0) + vertices[:, :2].max(0)) / 2
-    return Mesh.build(vertices, faces, _pattern(flat), _places(drawing, flat, behind)).in_order()
+    return Mesh.build(vertices, faces, _pattern(flat), _places(drawing, flat, behind)).renumber_along_longest_side()
 
 
 def _flatten(drawing: Drawing, triangles: int) -> _Flat:
@@ -91,10 +91,10 @@ def _flatten(drawing: Drawing, triangles: int) -> _Flat:
         raise InvalidInput("triangles", got=triangles, expected="a positive number")
     area = _check_drawing(drawing)
     edge, found = (4 * area / triangles / (0.75**0.5 / 2)) ** 0.5, []
-    for _ in range(ATTEMPTS):
+    for _ in range(MAX_EDGE_LENGTH_TRIALS):
         found.append(_half(drawing, edge))
         count = 4 * len(found[-1].faces)
-        if abs(count / triangles - 1) < CLOSE:
+        if abs(count / triangles - 1) < TRIANGLE_COUNT_TOLERANCE:
             break
         edge *= (count / triangles) ** 0.5
     return _mirrored(drawing, min(found, key=lambda half: abs(4 * len(half.faces) - triangles)))
@@ -102,11 +102,11 @@ def _flatten(drawing: Drawing, triangles: int) -> _Flat:
 
 def _half(drawing: Drawing, edge: float) -> _Flat:
     """The drawing's own half, its pieces joined."""
-    samples = {name: sample(curve.points, edge) for name, curve in drawing.curves.items()}
+    samples = {name: sample_polyline(curve.points, edge) for name, curve in drawing.curves.items()}
     parts, faces, panel, start = [], [], [], 0
     for number, piece in enumerate(drawing.pieces.values()):
         outline = [samples[c.removeprefix("-")][:: -1 if c[0] == "-" else 1][:-1] for c in piece.curves]
-        points, inside = fill(np.vstack(outline), edge)
+        points, inside = triangulate_outline(np.vstack(outline), edge)
         parts.append(points)
         faces.append(inside + start)
         panel += [number] * len(inside)
@@ -149,7 +149,7 @@ def _pattern(flat: _Flat) -> np.ndarray:
                 laid = flat.points @ np.stack([warp, side * np.array([-warp[1], warp[0]])], axis=1)
                 laid = laid[flat.faces[own][:, order]]
                 layer[own] = laid - laid.min((0, 1)) + [0.0, start]
-                start = layer[own][..., 1].max() + MARGIN
+                start = layer[own][..., 1].max() + PANEL_MARGIN_M
         layers.append(layer)
     return np.concatenate(layers)
 
@@ -160,7 +160,7 @@ def _lift(flat: _Flat, sewn: set[str], gap: float) -> np.ndarray:
         return np.zeros(len(flat.points))
     seams = [flat.points[index] for (_, name), index in flat.on.items() if name in sewn]
     distance = np.min([distance_to_path(flat.points, seam) for seam in seams], axis=0)
-    return gap / 2 * np.minimum(1.0, distance / (RAMP * gap))
+    return gap / 2 * np.minimum(1.0, distance / (LIFT_RAMP_GAPS * gap))
 
 
 def _places(drawing: Drawing, flat: _Flat, behind: np.ndarray) -> dict[str, np.ndarray]:

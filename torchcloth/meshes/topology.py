@@ -5,43 +5,43 @@ from __future__ import annotations
 import numpy as np
 
 
-def edges(faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def find_edges(faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """(edges [N, 2] with the lower vertex first, triangles at each [N]) of faces [F, 3]."""
     return np.unique(np.sort(_sides(faces), axis=1), axis=0, return_counts=True)
 
 
-def unlike(faces: np.ndarray) -> np.ndarray:
+def find_inconsistent_sides(faces: np.ndarray) -> np.ndarray:
     """Sides [N, 2] that several triangles run along in one direction: they turn unlike, or are more than two."""
     sides, times = np.unique(_sides(faces), axis=0, return_counts=True)
     return sides[times > 1]
 
 
-def seams(faces: np.ndarray, pattern: np.ndarray) -> np.ndarray:
+def find_seams(faces: np.ndarray, pattern: np.ndarray) -> np.ndarray:
     """Edges [N, 2] whose triangles lie apart on the pattern [F, 3, 2] m: there, two panels are sewn."""
     pairs = np.unique(_laid_sides(faces, pattern), axis=0)[:, :2]
     once, laid = np.unique(pairs, axis=0, return_counts=True)
     return once[laid > 1].astype(np.int64)
 
 
-def panels(faces: np.ndarray, pattern: np.ndarray) -> np.ndarray:
+def number_panels(faces: np.ndarray, pattern: np.ndarray) -> np.ndarray:
     """[F] number of the panel of each triangle: those that are joined on the pattern, without crossing a seam."""
     _, side = np.unique(_laid_sides(faces, pattern), axis=0, return_inverse=True)
     return _joined(side.reshape(-1, 3))
 
 
-def pieces(faces: np.ndarray) -> int:
+def count_pieces(faces: np.ndarray) -> int:
     """How many parts have no vertex in common."""
     return int(_joined(faces).max()) + 1
 
 
-def piece_of(faces: np.ndarray) -> np.ndarray:
+def number_pieces(faces: np.ndarray) -> np.ndarray:
     """[V] the part of each vertex of a triangle, numbers from 0 on; 0 for others."""
     out = np.zeros(int(faces.max(initial=-1)) + 1, np.int64)
     out[faces.ravel()] = np.repeat(_joined(faces), 3)
     return out
 
 
-def firsts(faces: np.ndarray) -> np.ndarray:
+def find_first_vertices(faces: np.ndarray) -> np.ndarray:
     """[pieces] a vertex of each."""
     return faces[np.unique(_joined(faces), return_index=True)[1], 0]
 
@@ -59,7 +59,7 @@ def _joined(touched: np.ndarray) -> np.ndarray:
         label = spread
 
 
-def farthest(faces: np.ndarray, rest: np.ndarray, start: int) -> tuple[int, float]:
+def find_farthest_vertex(faces: np.ndarray, rest: np.ndarray, start: int) -> tuple[int, float]:
     """(vertex, m): the one farthest from ``start`` along the edges of the rest shape, and how far; within its piece."""
     ends = _sides(faces)
     length = np.linalg.norm(rest[:, [1, 2, 0]] - rest, axis=-1).ravel()

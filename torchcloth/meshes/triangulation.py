@@ -7,11 +7,11 @@ import numpy as np
 from ..errors import InvalidInput
 from . import topology
 
-CLEARANCE = 0.6  # edge lengths between the outline and the first inner points
-ROUNDS, PUSH, STEP = 60, 1.15, 0.2  # of spreading: springs push up to PUSH times the mean edge
+MIN_RIM_DISTANCE_EDGES = 0.6  # edge lengths between the outline and the first inner points
+SPRING_ROUNDS, SPRING_LENGTH_RATIO, SPRING_STEP_FRACTION = 60, 1.15, 0.2  # of spreading: springs push up to PUSH times the mean edge
 
 
-def sample(curve: np.ndarray, edge: float) -> np.ndarray:
+def sample_polyline(curve: np.ndarray, edge: float) -> np.ndarray:
     """Points [N, 2] on a polyline [K, 2] in equal steps of about ``edge``, both ends exact."""
     length = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(curve, axis=0), axis=1))])
     stops = np.linspace(0.0, length[-1], max(1, round(length[-1] / edge)) + 1)
@@ -20,7 +20,7 @@ def sample(curve: np.ndarray, edge: float) -> np.ndarray:
     return points
 
 
-def fill(outline: np.ndarray, edge: float) -> tuple[np.ndarray, np.ndarray]:
+def triangulate_outline(outline: np.ndarray, edge: float) -> tuple[np.ndarray, np.ndarray]:
     """(points [N, 2], triangles [F, 3], counter-clockwise): the outline's points first, then inner ones.
 
     A hexagonal lattice whose edges act as springs that push (Persson and Strang 2004, "A simple mesh generator in
@@ -39,10 +39,10 @@ def fill(outline: np.ndarray, edge: float) -> tuple[np.ndarray, np.ndarray]:
     lattice = _hexagons(low, high, edge)
     inner = lattice[Path(outline).contains_points(lattice)]
     if len(inner):
-        inner = inner[distance_to_path(inner, np.vstack([outline, outline[:1]])) > CLEARANCE * edge]
+        inner = inner[distance_to_path(inner, np.vstack([outline, outline[:1]])) > MIN_RIM_DISTANCE_EDGES * edge]
     points = np.vstack([outline, inner])
     triangles = _delaunay(points, outline, edge)
-    for _ in range(ROUNDS):
+    for _ in range(SPRING_ROUNDS):
         points = _spread(points, triangles, len(outline))
         triangles = _delaunay(points, outline, edge)
     _check_outline(triangles, len(outline))
@@ -80,20 +80,20 @@ def _delaunay(points: np.ndarray, outline: np.ndarray, edge: float) -> np.ndarra
 
 def _spread(points: np.ndarray, triangles: np.ndarray, fixed: int) -> np.ndarray:
     """Points after ``fixed``, pushed by springs along the edges."""
-    ends, _ = topology.edges(triangles)
+    ends, _ = topology.find_edges(triangles)
     along = points[ends[:, 1]] - points[ends[:, 0]]
     length = np.linalg.norm(along, axis=1, keepdims=True)
-    push = np.maximum(PUSH * (length**2).mean() ** 0.5 - length, 0.0) * along / length
+    push = np.maximum(SPRING_LENGTH_RATIO * (length**2).mean() ** 0.5 - length, 0.0) * along / length
     moved = points.copy()
-    np.add.at(moved, ends[:, 1], STEP * push)
-    np.add.at(moved, ends[:, 0], -STEP * push)
+    np.add.at(moved, ends[:, 1], SPRING_STEP_FRACTION * push)
+    np.add.at(moved, ends[:, 0], -SPRING_STEP_FRACTION * push)
     moved[:fixed] = points[:fixed]
     return moved
 
 
 def _check_outline(triangles: np.ndarray, count: int) -> None:
     """Refuse triangles whose rim is not the outline: it crosses itself, or parts of it are nearer than an edge."""
-    sides, uses = topology.edges(triangles)
+    sides, uses = topology.find_edges(triangles)
     rim = np.sort(np.stack([np.arange(count), np.roll(np.arange(count), -1)], axis=1), axis=1)
     if not np.array_equal(sides[uses == 1], np.unique(rim, axis=0)):
         raise InvalidInput(

@@ -9,21 +9,21 @@ import torch
 from torch import Tensor, nn
 
 from ..boundaries import AbstractBoundary, Grasp
-from ..boundaries.motion import check as check_motion
-from ..boundaries.motion import check_cover
+from ..boundaries.motion import check_trajectory as check_motion
+from ..boundaries.motion import check_covers_times
 from ..dynamics.contact import Contact
-from ..dynamics.model import Model, mapped
+from ..dynamics.model import Model, tree_map
 from ..effects import AbstractEffect
 from ..errors import InvalidInput, SimulationDiverged, UnstableStep
 from ..materials import AbstractMaterial
 from ..meshes import Mesh
-from ..meshes.mesh import HEAVIEST, LARGEST
+from ..meshes.mesh import MAX_AREAL_DENSITY_KG_PER_M2, MAX_CLOTH_SPAN_M
 from ..parameters import PhysicalParameter
 from ..types import ClothState, Trajectory
 
-FRAMES = "at least two, increasing, finite seconds"
-MOST_SUBSTEPS = 10_000_000  # of one simulation: a minute of the stiffest cloth; poses of more fill the memory
-NAME = "a name without dots or a leading underscore that torch's ModuleDict has not"
+EXPECTED_FRAME_TIMES = "at least two, increasing, finite seconds"
+MAX_SUBSTEPS_PER_SIMULATION = 10_000_000  # of one simulation: a minute of the stiffest cloth; poses of more fill the memory
+EXPECTED_PART_NAME = "a name without dots or a leading underscore that torch's ModuleDict has not"
 
 
 def check_parts(
@@ -53,7 +53,7 @@ def is_name(name: object) -> bool:
 def check_part(what: str, name: object, part: object) -> None:
     """One of the "effects" or "boundaries"."""
     if not is_name(name):
-        raise InvalidInput("name of an effect or boundary", got=repr(name), expected=NAME)
+        raise InvalidInput("name of an effect or boundary", got=repr(name), expected=EXPECTED_PART_NAME)
     kind = {"effects": AbstractEffect, "boundaries": AbstractBoundary}[what]
     _check_kind(f"{what}: {name}", part, kind, f"an {kind.__name__}, as those of torchcloth.{what}")
 
@@ -73,14 +73,14 @@ def check_field(name: str, raw: Tensor, triangles: int | None) -> None:
         raise InvalidInput(name, got=f"shape {tuple(raw.shape)}", expected=expected)
 
 
-def doubts(mesh: Mesh, density: Tensor) -> Iterator[str]:
+def mesh_warnings(mesh: Mesh, density: Tensor) -> Iterator[str]:
     """What looks like another unit, though somebody may mean it."""
     span, heaviest = float(np.ptp(mesh.vertices, axis=0).max()), float(density.detach().max())
-    if span > LARGEST:
+    if span > MAX_CLOTH_SPAN_M:
         yield f"the mesh spans {span:.4g} m: is it in millimetres? Lengths are in metres"
-    if heaviest > HEAVIEST:
+    if heaviest > MAX_AREAL_DENSITY_KG_PER_M2:
         yield f"areal_density is {heaviest:.4g} kg/m^2: is it in g/m^2? Fabrics weigh 0.02 to 1 kg/m^2"
-    if torn := mesh.torn:
+    if torn := mesh.duplicated_vertex_count:
         yield (
             f"{torn} vertices of the mesh lie on others of another piece, so it falls apart there: if it is one cloth, "
             "weld them, and give pattern coordinates to the triangles' corners"
@@ -136,11 +136,11 @@ def check_times(times: Tensor | Sequence[float]) -> list[float]:
     try:
         flat = torch.as_tensor(times, dtype=torch.float64)
     except (TypeError, ValueError, RuntimeError) as error:
-        raise InvalidInput("times", got=f"{times!r:.40}", expected=FRAMES) from error
+        raise InvalidInput("times", got=f"{times!r:.40}", expected=EXPECTED_FRAME_TIMES) from error
     frames = flat.tolist() if flat.ndim == 1 else []
     if len(frames) < 2 or not np.all(np.isfinite(frames)) or not np.all(np.diff(frames) > 0):
         got = f"shape {tuple(flat.shape)}, first {frames[:3]}"
-        raise InvalidInput("times", got=got, expected=FRAMES)
+        raise InvalidInput("times", got=got, expected=EXPECTED_FRAME_TIMES)
     return frames
 
 
@@ -162,7 +162,7 @@ def check_parameters(cloth: nn.Module) -> None:
             if name.startswith("material.") or name == "areal_density":  # others may have been put in their place
                 check_field(name, part.raw, len(cloth.mesh.faces))  # type: ignore[arg-type]
             clips = part.domain == "nonnegative"
-            part.check(name, "call the cloth's clip_() after every step of an optimiser" if clips else "")
+            part.check_in_domain(name, "call the cloth's clip_() after every step of an optimiser" if clips else "")
 
 
 def check_step(dt: float | None, limit: float) -> float:
@@ -186,9 +186,9 @@ def check_step(dt: float | None, limit: float) -> float:
 def check_substeps(seconds: float, step: float, dt: float | None = None) -> None:
     """Refuse a simulation that would never end, because of the user's ``dt`` or of a stable ``step`` [s] that tiny."""
     count = seconds / step if step > 0 else float("inf")  # a step that overflowed is NaN
-    if count <= MOST_SUBSTEPS:
+    if count <= MAX_SUBSTEPS_PER_SIMULATION:
         return
-    got, expected = f"{step:.3g} s, that is {count:.2g} substeps", f"at most {MOST_SUBSTEPS:g}"
+    got, expected = f"{step:.3g} s, that is {count:.2g} substeps", f"at most {MAX_SUBSTEPS_PER_SIMULATION:g}"
     if dt is not None:
         raise InvalidInput("dt", got=got, expected=expected, remedy="raise dt, or leave it out")
     remedy = f"check the units of stiffnesses, densities and mesh, or simulate less than {seconds:.3g} s at once"
@@ -217,7 +217,7 @@ def check_motions(
     motion: Mapping[str, Trajectory], boundaries: nn.ModuleDict, frames: list[float], like: Tensor
 ) -> dict[str, Trajectory]:
     """One usable trajectory for every driven boundary, in the precision and on the device of ``like``."""
-    driven = {name for name, boundary in boundaries.items() if boundary.driven}
+    driven = {name for name, boundary in boundaries.items() if boundary.is_prescribed}
     check_mapping(motion)
     if set(motion) != driven:
         raise InvalidInput(
@@ -225,7 +225,7 @@ def check_motions(
         )
     for name, trajectory in motion.items():
         check_motion(trajectory, name)
-        check_cover(trajectory, name, frames[0], frames[-1])
+        check_covers_times(trajectory, name, frames[0], frames[-1])
     return {name: Trajectory(m.t, m.pose.to(like), m.closed) for name, m in motion.items()}
 
 
@@ -276,7 +276,7 @@ def expand_state(state: ClothState, model: Model, motion: Mapping[str, Trajector
     """
     tensors: list[Tensor] = []
     coefficients = (model.coefficients, model.areal_density, model.mass, *(c for _, c in model.effects.values()))
-    mapped(coefficients, lambda t: tensors.append(t) or t)
+    tree_map(coefficients, lambda t: tensors.append(t) or t)
     found = {
         **{f"state.{name}": field.shape[:-2] for name, field in _named(state).items()},
         **{f"motion[{name!r}].pose": trajectory.pose.shape[:-3] for name, trajectory in motion.items()},

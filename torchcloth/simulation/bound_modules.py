@@ -18,7 +18,7 @@ from ..meshes import Mesh
 from .argument_checks import check_axes, check_fields, check_part
 
 
-class Parts(nn.ModuleDict):
+class BoundModuleDict(nn.ModuleDict):
     """By name. What is put in, also later, is bound to the mesh and takes the precision and device of the others."""
 
     _like: torch.Tensor
@@ -30,7 +30,7 @@ class Parts(nn.ModuleDict):
 
     def __setitem__(self, key: str, module: Any) -> None:
         check_part(self._what, key, module)
-        check_free(self._mesh, [(key, module)])
+        check_not_bound_elsewhere(self._mesh, [(key, module)])
         if isinstance(module, AbstractEffect):
             check_fields({key: module}, len(self._mesh.faces))
             check_axes(self._mesh, {f"effects.{key}": module})
@@ -45,10 +45,10 @@ class Parts(nn.ModuleDict):
                 _OWNERS[part] = (ref(self),)
 
 
-def check_free(mesh: Mesh, parts: Iterable[tuple[str, AbstractEffect | AbstractBoundary]]) -> None:
+def check_not_bound_elsewhere(mesh: Mesh, parts: Iterable[tuple[str, AbstractEffect | AbstractBoundary]]) -> None:
     """Refuse what is bound to another cloth's mesh: it would be bound anew under that one's feet."""
     for name, part in parts:
-        if any((owner := known()) is not None and not owner._mesh.same(mesh) for known in _owners(part)):
+        if any((owner := known()) is not None and not owner._mesh.is_equal(mesh) for known in _owners(part)):
             raise InvalidInput(
                 name,
                 got="an effect or boundary of another cloth, bound to its mesh",
@@ -57,7 +57,7 @@ def check_free(mesh: Mesh, parts: Iterable[tuple[str, AbstractEffect | AbstractB
             )
 
 
-class Loose(NamedTuple):
+class UnboundParts(NamedTuple):
     """Copies of a cloth's parts that no cloth owns yet."""
 
     material: AbstractMaterial
@@ -66,19 +66,19 @@ class Loose(NamedTuple):
     boundaries: dict[str, AbstractBoundary]
 
 
-def loose(cloth: Any) -> Loose:
+def copy_parts(cloth: Any) -> UnboundParts:
     """What another cloth may be built from, on any mesh; what they share among them they share still."""
     memo = {id(cloth.mesh): cloth.mesh}
     effects, boundaries = (
         {name: copy.deepcopy(part, memo) for name, part in parts.items()} for parts in (cloth.effects, cloth.boundaries)
     )
     density = cloth.areal_density.value.detach().clone()
-    return Loose(copy.deepcopy(cloth.material, memo), density, effects, boundaries)
+    return UnboundParts(copy.deepcopy(cloth.material, memo), density, effects, boundaries)
 
 
-def _owners(part: nn.Module) -> tuple[ref[Parts], ...]:
+def _owners(part: nn.Module) -> tuple[ref[BoundModuleDict], ...]:
     """Those that live."""
     return tuple(owner for owner in _OWNERS.get(part, ()) if owner() is not None)
 
 
-_OWNERS: WeakKeyDictionary[nn.Module, tuple[ref[Parts], ...]] = WeakKeyDictionary()
+_OWNERS: WeakKeyDictionary[nn.Module, tuple[ref[BoundModuleDict], ...]] = WeakKeyDictionary()

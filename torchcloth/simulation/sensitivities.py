@@ -9,20 +9,20 @@ import torch
 import torch.autograd.forward_ad as forward_ad
 from torch import Tensor, nn
 
-from .._utils.forward_mode import real_tangents
-from .._utils.torch_modes import undisturbed
-from ..boundaries import Drive
-from ..dynamics.model import Model, kept
+from .._utils.forward_mode import dense_tangents
+from .._utils.torch_modes import disable_autocast
+from ..boundaries import PrescribedMotion
+from ..dynamics.model import Model, shallow_clone_module
 from ..engine.tangents import FusedTangents
 from ..errors import InvalidInput
-from ..parameters import PhysicalParameter, called
+from ..parameters import PhysicalParameter, call_with_parameters
 from ..types import ClothState, Rollout, Trajectory
 from .argument_checks import check_numbers
-from .initial_state import damped, held, stopped
-from .rollout import Interval, Plan, check_finite, collect
+from .initial_state import with_mass_damping, stationary_motion, require_at_rest
+from .rollout import FrameInterval, RolloutSchedule, check_finite, collect_rollout
 
-RATE = 30.0  # 1/s, of the damping while the cloth settles
-DECORATED = 6  # calls below the user's, decorators too
+SETTLING_DAMPING_RATE_PER_S = 30.0  # 1/s, of the damping while the cloth settles
+WARNING_STACK_LEVEL = 6  # calls below the user's, decorators too
 
 
 class Directions(NamedTuple):
@@ -35,8 +35,8 @@ class Directions(NamedTuple):
 
 @torch.inference_mode(False)  # in which tangents are lost
 @torch.no_grad()
-@undisturbed()
-def sensitivities(
+@disable_autocast()
+def compute_sensitivities(
     cloth: Any,
     state: ClothState,
     motion: Mapping[str, Trajectory],
@@ -46,8 +46,8 @@ def sensitivities(
     settle: float,
 ) -> tuple[Rollout, Rollout]:  # a cloth is Any here: the layer stands above this file
     """See ``Cloth.sensitivities``."""
-    cloth = kept(cloth)  # parameters are replaced meanwhile, and others may simulate the same cloth
-    plan = cloth.plan(state, motion, times, dt)  # which refuses other states and motions first
+    cloth = shallow_clone_module(cloth)  # parameters are replaced meanwhile, and others may simulate the same cloth
+    plan = cloth.schedule(state, motion, times, dt)  # which refuses other states and motions first
     count = _check(along, cloth, state, motion)
     fused = plan.choice.fused
     if fused is None or not fused.has_tangents:
@@ -55,20 +55,20 @@ def sensitivities(
     state, moved = plan.state, _tangent_of(plan.state, along, count)
     if settle:
         start = plan.frames[0]
-        rest = cloth.settling(state, motion, start, settle, RATE)
-        walk = _Walk(cloth, rest, lambda: damped(cloth.model(), RATE), along, count)
-        poses = _Poses(motion, along, count, lambda m: held(m, rest.frames[0], rest.frames[-1]))
+        rest = cloth.schedule_settling(state, motion, start, settle, SETTLING_DAMPING_RATE_PER_S)
+        walk = _Walk(cloth, rest, lambda: with_mass_damping(cloth.build_model(), SETTLING_DAMPING_RATE_PER_S), along, count)
+        poses = _Poses(motion, along, count, lambda m: stationary_motion(m, rest.frames[0], rest.frames[-1]))
         (states, _), (shifts, _) = walk.run(state, moved, poses)
-        state, moved = stopped(states[-1], settle, DECORATED), shifts[-1].stopped()
-    found = _Walk(cloth, plan, cloth.model, along, count).run(state, moved, _Poses(motion, along, count))
-    values, tangents = (collect(plan, states, impulses) for states, impulses in found)
+        state, moved = require_at_rest(states[-1], settle, WARNING_STACK_LEVEL), shifts[-1].at_rest()
+    found = _Walk(cloth, plan, cloth.build_model, along, count).run(state, moved, _Poses(motion, along, count))
+    values, tangents = (collect_rollout(plan, states, impulses) for states, impulses in found)
     return values, tangents
 
 
 class _Walk:
     """A plan, interval by interval, with tangents beside the values."""
 
-    def __init__(self, cloth: nn.Module, plan: Plan, build: Callable[[], Model], along: Directions, count: int) -> None:
+    def __init__(self, cloth: nn.Module, plan: RolloutSchedule, build: Callable[[], Model], along: Directions, count: int) -> None:
         self.cloth, self.plan, self.build, self.along, self.count = cloth, plan, build, along, count
 
     def run(self, state: ClothState, moved: ClothState, poses: _Poses):
@@ -78,14 +78,14 @@ class _Walk:
             raise ValueError("the reference has no such tangents")
         engine = FusedTangents(fused, self._within, self.count)
         values, tangents, lost = ([state], []), ([moved], []), None
-        for interval in self.plan.intervals(lambda: values[0][-1]):
-            before, drives = state, interval.drives()
+        for interval in self.plan.iterate_intervals(lambda: values[0][-1]):
+            before, drives = state, interval.sample_motion()
             driven = poses.tangents(interval, state.x.ndim - 2)
             state, lost, moved, given, shift = engine.rollout(
                 state, lost, moved, interval.dt, drives, driven, interval.count
             )
             check_finite(interval, before, state)
-            self.plan.check(state)
+            self.plan.check_extent(state)
             for (states, impulses), s, j in ((values, state, given), (tangents, moved, shift)):
                 states.append(s)
                 impulses.append(j)
@@ -98,9 +98,9 @@ class _Walk:
         if not changes:
             return {}
         batch = self.plan.state.x.ndim - 2
-        with forward_ad.dual_level(), real_tangents():
+        with forward_ad.dual_level(), dense_tangents():
             entries = _dual_copies(self.cloth, {name: tangent[changes] for name, tangent in given.items()}, batch)
-            found = called(_Built(self.cloth, self.build, work), entries, ())
+            found = call_with_parameters(_Built(self.cloth, self.build, work), entries, ())
             tangents = ((key, forward_ad.unpack_dual(dual).tangent) for key, dual in found.items())
             moved = {key: tangent for key, tangent in tangents if tangent is not None}
         every = {key: t.new_zeros(self.count, *t.shape[1:]) for key, t in moved.items()}
@@ -129,7 +129,7 @@ class _Poses(NamedTuple):
     count: int
     becomes: Callable[[Mapping[str, Trajectory]], Mapping[str, Trajectory]] = dict
 
-    def tangents(self, interval: Interval, batch: int) -> dict[str, Drive]:
+    def tangents(self, interval: FrameInterval, batch: int) -> dict[str, PrescribedMotion]:
         """Of the drives of an interval [K, ...]; nothing where no pose changes."""
         if not self.along.motion:
             return {}
@@ -137,7 +137,7 @@ class _Poses(NamedTuple):
             motion = self.becomes(_dual_motion(self.motion, self.along, self.count, batch))
             like = interval.motion
             motion = {name: m._replace(pose=m.pose.to(like[name].pose)) for name, m in motion.items()}
-            drives = interval._replace(motion=motion, moves=None).drives()
+            drives = interval._replace(motion=motion, prescribed=None).sample_motion()
             return {
                 name: drives[name]._replace(
                     increment=_tangent(drives[name].increment), pose=_tangent(drives[name].pose)
@@ -148,7 +148,7 @@ class _Poses(NamedTuple):
 
 def _by_copies(
     cloth: Any,
-    plan: Plan,
+    plan: RolloutSchedule,
     motion: Mapping[str, Trajectory],
     along: Directions,
     count: int,
@@ -157,13 +157,13 @@ def _by_copies(
 ) -> tuple[Rollout, Rollout]:
     """K dual copies side by side: what every engine can do."""
     state, batch = plan.state, plan.state.x.ndim - 2
-    with forward_ad.dual_level(), real_tangents():
+    with forward_ad.dual_level(), dense_tangents():
         entries = _dual_copies(cloth, along.parameters, batch)
         many = state.map(lambda field: _own(field.expand(count, *field.shape)))
         if along.state is not None:
             many = _both(many, _tangent_of(state, along, count), forward_ad.make_dual)
         moved = _dual_motion(motion, along, count, batch)
-        out = called(_Replay(cloth), entries, (many, moved, plan.times, dt, settle))
+        out = call_with_parameters(_Replay(cloth), entries, (many, moved, plan.times, dt, settle))
         primal = _each(out, lambda t: forward_ad.unpack_dual(t).primal[0].clone())
         return primal, _each(out, _tangent)
 
@@ -178,7 +178,7 @@ class _Replay(nn.Module):
     def forward(self, state: ClothState, motion: Any, frames: list[float], dt: float | None, settle: float) -> Rollout:
         """The rollout."""
         if settle:
-            state = self.cloth.settle(state, motion, start=frames[0], duration=settle, rate=RATE)
+            state = self.cloth.settle(state, motion, start=frames[0], duration=settle, rate=SETTLING_DAMPING_RATE_PER_S)
         return self.cloth(state, motion, frames, dt=dt)
 
 

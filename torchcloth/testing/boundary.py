@@ -7,11 +7,11 @@ from abc import abstractmethod
 import torch
 from torch import Tensor
 
-from ..boundaries import AbstractBoundary, Drive, drive
+from ..boundaries import AbstractBoundary, PrescribedMotion, sample_trajectory
 from ..meshes import Mesh, rectangle
 from ..types import Trajectory
 from . import samples
-from .contract import Contract, batched, call_with, close, demand, finite_gradients, float64, parameters_of, single
+from .contract import Contract, batch_parameters, call_with, require_close, require, require_finite_gradients, float64, detached_parameters, unbatch_parameters
 from .finite_differences import check_gradients
 
 
@@ -60,11 +60,11 @@ class BoundaryContract(Contract):
         pose[:, :3, 3] = 0.1 * angle[:, 0] ** 2 * pose.new_tensor([1.0, -0.5, 0.7])
         return pose
 
-    def _drive(self, pose: Tensor, closed: bool = True) -> Drive:
+    def _drive(self, pose: Tensor, closed: bool = True) -> PrescribedMotion:
         """The substeps of a body that goes through the poses at equal times."""
         t = torch.linspace(0.0, self.substeps * self.dt, pose.shape[-3], dtype=pose.dtype)
         substeps = torch.linspace(0.0, float(t[-1]), self.substeps + 1, dtype=pose.dtype)
-        return drive(Trajectory(t, pose, torch.full((len(t),), closed)), substeps)
+        return sample_trajectory(Trajectory(t, pose, torch.full((len(t),), closed)), substeps)
 
     def _pose(self) -> Tensor | None:
         """[K, 4, 4] of a body that moves; None: the boundary stands still."""
@@ -82,19 +82,19 @@ class BoundaryContract(Contract):
         """On the sampled state it changes some velocities; else the other tests show nothing."""
         inputs = self._inputs()
         changed = (self._apply(self._boundary(), **inputs).detach() != inputs["v"]).any(-1)
-        demand(changed.any(), "the boundary changes nothing on sample(); override sample()")
+        require(changed.any(), "the boundary changes nothing on sample(); override sample()")
 
     def test_applying_twice_changes_nothing(self) -> None:
         """What obeys a boundary passes it unchanged."""
         boundary, inputs = self._boundary(), self._inputs()
         once = self._apply(boundary, **inputs).detach()
         twice = self._apply(boundary, **{**inputs, "v": once}).detach()
-        close(twice, once, 1e-11, "applying the boundary twice differs from once")
+        require_close(twice, once, 1e-11, "applying the boundary twice differs from once")
 
     def test_gradients(self) -> None:
         """Sweeps in positions, velocities, poses and every parameter."""
         boundary = self._boundary()
-        names = parameters_of(boundary)
+        names = detached_parameters(boundary)
 
         def evaluate(**values: Tensor) -> Tensor:
             own = {name: values.pop(name) for name in names}
@@ -111,14 +111,14 @@ class BoundaryContract(Contract):
         state = {"x": x, "v": v} if pose is None else {"x": x, "v": v, "pose": pose}
         leaves = {name: value.clone().requires_grad_() for name, value in state.items()}
         result = self._apply(boundary, **leaves)
-        demand(torch.isfinite(result).all(), "velocities are not finite at rest on the boundary")
-        finite_gradients(result, {**leaves, **dict(boundary.named_parameters())}, "at rest on the boundary")
+        require(torch.isfinite(result).all(), "velocities are not finite at rest on the boundary")
+        require_finite_gradients(result, {**leaves, **dict(boundary.named_parameters())}, "at rest on the boundary")
 
     def test_batches_equal_loops(self) -> None:
         """Batched states, poses and parameters give what a loop gives."""
         boundary = self._boundary()
-        parameters = parameters_of(boundary)
-        many = batched(parameters, 3)
+        parameters = detached_parameters(boundary)
+        many = batch_parameters(parameters, 3)
         stacks = {name: torch.stack([value] * 3) for name, value in self._inputs().items()}
         stacks["v"] = stacks["v"] * torch.tensor([1.0, -1.0, 0.5], dtype=torch.float64)[:, None, None]
         if "pose" in stacks:
@@ -128,24 +128,24 @@ class BoundaryContract(Contract):
         together = call_with(boundary, many, self._apply, *stacks.values()).detach()
         for k in range(3):
             one = [value[k] for value in stacks.values()]
-            alone = call_with(boundary, single(many, parameters, k), self._apply, *one).detach()
-            close(together[k], alone, 1e-12, f"batch entry {k} differs from the loop")
+            alone = call_with(boundary, unbatch_parameters(many, parameters, k), self._apply, *one).detach()
+            require_close(together[k], alone, 1e-12, f"batch entry {k} differs from the loop")
 
     def test_works_in_float32(self) -> None:
         """Same velocities to single precision, and no silent promotion."""
         inputs = self._inputs()
         exact = self._apply(self._boundary(), **inputs).detach()
         got = self._apply(self._boundary().float(), **{k: value.float() for k, value in inputs.items()}).detach()
-        demand(got.dtype == torch.float32, f"apply answers float32 with {got.dtype}")
+        require(got.dtype == torch.float32, f"apply answers float32 with {got.dtype}")
         # positions of 0.3 m in float32 over a step of 1 ms: 2e-8 m / 1e-3 s = 2e-5 m/s
-        close(got.double(), exact, 1e-4, "velocities in float32")
+        require_close(got.double(), exact, 1e-4, "velocities in float32")
 
 
 class GraspContract(BoundaryContract):
     """What the layer relies on in a boundary that carries vertices along a trajectory. Override ``make``, ``held``."""
 
     @abstractmethod
-    def held(self) -> list[int]:
+    def gripped_vertices(self) -> list[int]:
         """The vertices that are carried."""
 
     def _pose(self) -> Tensor:
@@ -153,12 +153,12 @@ class GraspContract(BoundaryContract):
 
     def test_is_driven(self) -> None:
         """Without a trajectory the layer must refuse to run."""
-        demand(type(self._boundary()).driven, "a grasp must declare driven = True")
+        require(type(self._boundary()).is_prescribed, "a grasp must declare driven = True")
 
     def test_held_vertices_follow_the_pose_exactly(self) -> None:
         """No drift over many substeps, whatever the rest of the cloth does."""
         boundary = self._boundary()
-        pose, held = self._pose(), self.held()
+        pose, held = self._pose(), self.gripped_vertices()
         motion = self._drive(pose)
         x, v = self.sample()
         start, wild = x[held], v
@@ -167,17 +167,17 @@ class GraspContract(BoundaryContract):
             x = x + self.dt * v
         turn = pose[-1, :3, :3] @ pose[0, :3, :3].mT
         expected = (start - pose[0, :3, 3]) @ turn.mT + pose[-1, :3, 3]
-        close(x[held], expected, 1e-12, "held vertices do not follow the pose")
+        require_close(x[held], expected, 1e-12, "held vertices do not follow the pose")
 
     def test_says_what_it_holds(self) -> None:
         """While it is closed, and nothing while it is open."""
         boundary, pose = self._boundary(), self._pose()
-        index = boundary.held(self._drive(pose), 0)
-        demand(index is not None and sorted(index.tolist()) == sorted(self.held()), "held() names other vertices")
-        demand(boundary.held(self._drive(pose, False), 0) is None, "an open gripper says that it holds")
+        index = boundary.prescribed_vertices(self._drive(pose), 0)
+        require(index is not None and sorted(index.tolist()) == sorted(self.gripped_vertices()), "held() names other vertices")
+        require(boundary.prescribed_vertices(self._drive(pose, False), 0) is None, "an open gripper says that it holds")
 
     def test_an_open_gripper_lets_go(self) -> None:
         """Velocities pass untouched."""
         x, v = self.sample()
         after = self._boundary().constrain(x, v, self.dt, self._drive(self._pose(), False), 0)
-        demand(torch.equal(after, v), "an open gripper changes the cloth")
+        require(torch.equal(after, v), "an open gripper changes the cloth")

@@ -12,7 +12,7 @@ from .._utils.linalg import cross, dot
 from ..boundaries import AbstractCollider
 from . import samples
 from .boundary import BoundaryContract
-from .contract import close, demand, finite_gradients, float64
+from .contract import require_close, require, require_finite_gradients, float64
 
 
 class ColliderContract(BoundaryContract):
@@ -76,8 +76,8 @@ class ColliderContract(BoundaryContract):
         p = self._at(0.02 * self.extent * samples.normal((200, 1), 4))[0].requires_grad_()
         distance, normal = body.clearance(p)
         (slope,) = torch.autograd.grad(distance.sum(), p)
-        close(dot(normal, normal), torch.ones_like(distance), 1e-12, "normals are not unit vectors")
-        close(slope, normal, self.slant, "the normal is not the gradient of the distance")
+        require_close(dot(normal, normal), torch.ones_like(distance), 1e-12, "normals are not unit vectors")
+        require_close(slope, normal, self.slant, "the normal is not the gradient of the distance")
 
     def test_the_distance_leads_to_the_surface(self) -> None:
         """Going back along the normal by the distance ends at distance 0: it is in metres."""
@@ -85,17 +85,17 @@ class ColliderContract(BoundaryContract):
         p, _ = self._at(0.02 * self.extent * samples.normal((200, 1), 4))
         distance, normal = body.clearance(p)
         left = float(body.clearance(p - distance * normal)[0].detach().abs().max())
-        demand(left <= self.rounding, f"the surface is missed by {left:.2e} m")
+        require(left <= self.rounding, f"the surface is missed by {left:.2e} m")
 
     def test_is_finite_everywhere(self) -> None:
         """Distances, normals and derivatives at centres, axes, edges and far away."""
         body = self._body()
         p = self._lattice().requires_grad_()
         distance, normal = body.clearance(p)
-        demand(torch.isfinite(distance).all() and torch.isfinite(normal).all(), "distance or normal is not finite")
-        close(dot(normal, normal), torch.ones_like(distance), 1e-12, "normals are not unit vectors everywhere")
+        require(torch.isfinite(distance).all() and torch.isfinite(normal).all(), "distance or normal is not finite")
+        require_close(dot(normal, normal), torch.ones_like(distance), 1e-12, "normals are not unit vectors everywhere")
         leaves = {"p": p, **dict(body.named_parameters())}
-        finite_gradients(torch.cat([distance, normal], dim=-1), leaves, "on a lattice through the body")
+        require_finite_gradients(torch.cat([distance, normal], dim=-1), leaves, "on a lattice through the body")
 
     def test_nothing_enters(self) -> None:
         """What starts outside ends outside, but for the curvature within one substep."""
@@ -104,7 +104,7 @@ class ColliderContract(BoundaryContract):
         after = body.constrain(x, v, self.dt, None, 0)
         curved = float((self.dt * after.detach()).norm(dim=-1).max()) ** 2 / self.extent
         deepest = float(body.clearance(x + self.dt * after)[0].detach().min())
-        demand(deepest >= -curved - self.rounding, f"{-deepest:.2e} m deep after a substep")
+        require(deepest >= -curved - self.rounding, f"{-deepest:.2e} m deep after a substep")
 
     def test_what_starts_inside_is_moved_out_gently(self) -> None:
         """At the given speed, not at depth over dt; and it does not go deeper."""
@@ -113,10 +113,10 @@ class ColliderContract(BoundaryContract):
         distance, normal = (part.detach() for part in body.clearance(x))
         still = body.constrain(x, torch.zeros_like(x), self.dt, None, 0).detach()
         speed = dot(still, normal)
-        demand((distance < 0).all(), "the trial did not start inside")
-        demand((speed > 0).all() and (still.norm(dim=-1) <= 0.05 * (1 + 1e-9)).all(), "not moved out at <= 0.05 m/s")
+        require((distance < 0).all(), "the trial did not start inside")
+        require((speed > 0).all() and (still.norm(dim=-1) <= 0.05 * (1 + 1e-9)).all(), "not moved out at <= 0.05 m/s")
         moved = dot(body.constrain(x, v, self.dt, None, 0).detach(), normal)
-        demand((moved >= 0.05 * (1 - 1e-9)).all(), "what is inside goes deeper")
+        require((moved >= 0.05 * (1 - 1e-9)).all(), "what is inside goes deeper")
 
     def test_friction_stays_in_the_cone(self) -> None:
         """It opposes the slip, takes at most mu times the push, and exactly that from what still slips."""
@@ -126,12 +126,12 @@ class ColliderContract(BoundaryContract):
         change, mu = after - v, float(body.friction.value.detach())
         push, slip, left = dot(change, normal), v - dot(v, normal) * normal, after - dot(after, normal) * normal
         taken = (change - push * normal).norm(dim=-1, keepdim=True)
-        demand((push > 0).any() and mu > 0, "nothing touches, or without friction")
-        demand((push >= 0).all() and (taken <= mu * push + 1e-9).all(), "outside the friction cone")
-        demand((cross(left, slip).norm(dim=-1) <= 1e-9).all() and (dot(left, slip) >= -1e-9).all(), "slip is deflected")
+        require((push > 0).any() and mu > 0, "nothing touches, or without friction")
+        require((push >= 0).all() and (taken <= mu * push + 1e-9).all(), "outside the friction cone")
+        require((cross(left, slip).norm(dim=-1) <= 1e-9).all() and (dot(left, slip) >= -1e-9).all(), "slip is deflected")
         slides = left.norm(dim=-1, keepdim=True) > 1e-6
-        demand((slides & (push > 0)).any(), "nothing slides")
-        close(taken[slides], mu * push[slides], 1e-9, "sliding friction is not mu times the push")
+        require((slides & (push > 0)).any(), "nothing slides")
+        require_close(taken[slides], mu * push[slides], 1e-9, "sliding friction is not mu times the push")
 
     def test_forward_mode_agrees_with_reverse_mode(self) -> None:
         """In positions and velocities."""
@@ -146,7 +146,7 @@ class ColliderContract(BoundaryContract):
         leaves = (x.clone().requires_grad_(), v.clone().requires_grad_())
         slopes = torch.autograd.grad(answer(*leaves), leaves)
         reverse = sum((a * b).sum() for a, b in zip(slopes, along, strict=True))
-        close(forward, torch.as_tensor(reverse), 1e-10, "forward and reverse mode differ")
+        require_close(forward, torch.as_tensor(reverse), 1e-10, "forward and reverse mode differ")
 
     def test_moves_as_a_rigid_body(self) -> None:
         """Seen from the travelling body, cloth meets what it meets at a body that stands still."""
@@ -158,8 +158,8 @@ class ColliderContract(BoundaryContract):
         world = x @ start[:3, :3].mT + start[:3, 3]
         carried = (world @ step[:3, :3].mT + step[:3, 3] - world) / self.dt
         moving = self._body(moving=True)
-        demand(moving.driven, "a moving collider must declare driven = True")
+        require(moving.is_prescribed, "a moving collider must declare driven = True")
         got = moving.constrain(world, v @ turn.mT + carried, self.dt, motion, k).detach()
         fixed = self._body(moving=False).constrain(x, v, self.dt, None, k).detach()
-        close(got, fixed @ turn.mT + carried, 1e-9, "a moving body answers differently from a fixed one")
-        demand((origin.abs() > 0.01).any(), "the body did not travel")
+        require_close(got, fixed @ turn.mT + carried, 1e-9, "a moving body answers differently from a fixed one")
+        require((origin.abs() > 0.01).any(), "the body did not travel")

@@ -51,23 +51,23 @@ def call_with(part: nn.Module, parameters: dict[str, Tensor], function: Callable
     return functional_call(_Caller(part, function), named, args)
 
 
-def parameters_of(part: nn.Module) -> dict[str, Tensor]:
+def detached_parameters(part: nn.Module) -> dict[str, Tensor]:
     """The part's own parameters by name, detached."""
     return {name: value.detach() for name, value in part.named_parameters()}
 
 
-def batched(parameters: dict[str, Tensor], size: int, spread: float = 0.1) -> dict[str, Tensor]:
+def batch_parameters(parameters: dict[str, Tensor], size: int, spread: float = 0.1) -> dict[str, Tensor]:
     """``size`` different copies of each parameter in the layout of a batch: [] -> [B, 1], [...] -> [B, ...]."""
     factor = 1 + spread * torch.linspace(-1, 1, size, dtype=torch.float64)
     return {name: factor.reshape(-1, *[1] * max(1, p.ndim)) * p for name, p in parameters.items()}
 
 
-def single(parameters: dict[str, Tensor], like: dict[str, Tensor], k: int) -> dict[str, Tensor]:
+def unbatch_parameters(parameters: dict[str, Tensor], like: dict[str, Tensor], k: int) -> dict[str, Tensor]:
     """Copy ``k`` of a batch of parameters, in the shape of the unbatched ones."""
     return {name: value[k].reshape(like[name].shape) for name, value in parameters.items()}
 
 
-def close(got: Tensor, expected: Tensor, tolerance: float, message: str) -> None:
+def require_close(got: Tensor, expected: Tensor, tolerance: float, message: str) -> None:
     """Demand |got - expected| <= tolerance x largest |expected|.
 
     Raises:
@@ -84,13 +84,13 @@ def close(got: Tensor, expected: Tensor, tolerance: float, message: str) -> None
         raise AssertionError(f"{message}: off by {error:.2e}, allowed {tolerance:.0e} of {scale:.3e}")
 
 
-def demand(condition: bool | Tensor, message: str) -> None:
+def require(condition: bool | Tensor, message: str) -> None:
     """Raise AssertionError with ``message`` unless ``condition``; unlike ``assert``, also under ``python -O``."""
     if not bool(condition):
         raise AssertionError(message)
 
 
-def finite_gradients(result: Tensor, leaves: dict[str, Tensor], where: str) -> None:
+def require_finite_gradients(result: Tensor, leaves: dict[str, Tensor], where: str) -> None:
     """Demand finite gradients of ``result``'s sum.
 
     Raises:
@@ -98,4 +98,4 @@ def finite_gradients(result: Tensor, leaves: dict[str, Tensor], where: str) -> N
     """
     gradients = torch.autograd.grad(result.sum(), list(leaves.values()), retain_graph=True, allow_unused=True)
     for name, gradient in zip(leaves, gradients, strict=True):
-        demand(gradient is None or torch.isfinite(gradient).all(), f"the gradient in {name!r} is not finite {where}")
+        require(gradient is None or torch.isfinite(gradient).all(), f"the gradient in {name!r} is not finite {where}")

@@ -10,13 +10,13 @@ from torch import Tensor
 
 from ..boundaries import Grasp
 from ..cloth import Cloth
-from ..dynamics import substep
+from ..dynamics.kinematics import Geometry, surface
 from ..effects import AbstractEffect, Amplitude
 from ..materials import AEP
 from ..meshes import Mesh, rectangle
-from ..types import ClothState, Moment, Trajectory
+from ..types import ClothState, EffectInputs, Trajectory
 from . import samples
-from .contract import Contract, batched, call_with, close, demand, finite_gradients, float64, parameters_of, single
+from .contract import Contract, batch_parameters, call_with, require_close, require, require_finite_gradients, float64, detached_parameters, unbatch_parameters
 from .finite_differences import check_gradients
 
 
@@ -46,9 +46,9 @@ class EffectContract(Contract):
 
     def _size(self, effect: AbstractEffect) -> Amplitude:
         amplitudes = getattr(type(effect), "amplitudes", {})
-        demand(len(amplitudes) > 0, "the effect declares no amplitudes")
+        require(len(amplitudes) > 0, "the effect declares no amplitudes")
         name = next(iter(amplitudes)) if self.amplitude is None else self.amplitude
-        demand(name in amplitudes, f"the effect declares no amplitude {name!r}")
+        require(name in amplitudes, f"the effect declares no amplitude {name!r}")
         return amplitudes[name]
 
     def _cloth(self, effects: dict[str, AbstractEffect]) -> Cloth:
@@ -66,28 +66,28 @@ class EffectContract(Contract):
 
         An effect that remembers has come from the flat sheet, through half the way, to ``x``.
         """
-        model = self._cloth({}).model()
+        model = self._cloth({}).build_model()
         rest = torch.as_tensor(self.mesh().vertices)
 
         def answers(effect: AbstractEffect, x: Tensor, v: Tensor) -> dict[str, Tensor]:
             geometry, mass = _cast(model.geometry, x.dtype), model.mass.to(x.dtype).detach()
             c = effect.coefficients()
-            memory = effect.start(rest.to(x).expand_as(x))
-            now = Moment(x, v, substep.surface(geometry, x, v), mass, memory, dt=1e-3)
+            memory = effect.initial_memory(rest.to(x).expand_as(x))
+            now = EffectInputs(x, v, surface(geometry, x, v), mass, memory, dt=1e-3)
             if now.memory is not None:
                 half = (rest.to(x) + x) / 2
-                between = now._replace(x=half, surface=substep.surface(geometry, half, v))
-                now = now._replace(memory=effect.evolve(c, between))
-                now = now._replace(memory=effect.evolve(c, now))
+                between = now._replace(x=half, surface=surface(geometry, half, v))
+                now = now._replace(memory=effect.update_memory(c, between))
+                now = now._replace(memory=effect.update_memory(c, now))
             index = torch.arange(3)
             held = v.index_fill(-2, index, 0.0)
-            loose = effect.loosen(c, index, v, held, mass, 1e-3, None)
+            loose = effect.grip_velocities(c, index, v, held, mass, 1e-3, None)
             found = {
                 "force": effect.force(c, now),
                 "viscous": effect.viscous(c, now),
                 "mass": effect.mass(c),
                 "inertia": effect.inertia(c, now.surface),
-                "growth": effect.growth(c),
+                "growth": effect.rest_deformation(c),
                 "memory": now.memory,
                 "grip": None if effect.grasp is None else loose,
             }
@@ -113,29 +113,29 @@ class EffectContract(Contract):
         effect = self._effect()
         kind = type(effect)
         for name, size in kind.amplitudes.items():
-            demand(hasattr(effect, name), f"the effect has no parameter {name!r} for its amplitude")
-            demand(bool(size.unit), f"the amplitude {name!r} has no unit")
-            demand(0 < size.smallest <= size.typical, f"smallest of {name!r} must lie in (0, typical]")
-            demand(all(isinstance(other, str) for other in size.equivalences), "equivalences must be names")
-        demand(kind.acts_on in ("vertices", "triangles"), f"acts_on must not be {kind.acts_on!r}")
+            require(hasattr(effect, name), f"the effect has no parameter {name!r} for its amplitude")
+            require(bool(size.unit), f"the amplitude {name!r} has no unit")
+            require(0 < size.smallest <= size.typical, f"smallest of {name!r} must lie in (0, typical]")
+            require(all(isinstance(other, str) for other in size.equivalences), "equivalences must be names")
+        require(kind.acts_on in ("vertices", "triangles"), f"acts_on must not be {kind.acts_on!r}")
         mesh = self.mesh()
         rows = len(mesh.vertices if kind.acts_on == "vertices" else mesh.faces)
         answers = self._answers()(effect, **self._state())
-        demand(len(answers) > 0, "the effect answers nothing")
+        require(len(answers) > 0, "the effect answers nothing")
         shape = tuple(answers["force"].shape) if "force" in answers else (rows, 3)
-        demand(shape == (rows, 3), f"force has shape {shape}; acts_on = {kind.acts_on!r} promises ({rows}, 3)")
+        require(shape == (rows, 3), f"force has shape {shape}; acts_on = {kind.acts_on!r} promises ({rows}, 3)")
 
     def test_amplitude_zero_is_bitwise_the_base_model(self) -> None:
         """Also the stable step must be the same, or the comparison of models would compare steps."""
         runs = [self._run(effects) for effects in (self.base(), {"effect": self.make(0.0)})]
-        demand(torch.equal(runs[0].x, runs[1].x), "amplitude 0 changes the positions of the base model")
-        demand(torch.equal(runs[0].v, runs[1].v), "amplitude 0 changes the velocities of the base model")
+        require(torch.equal(runs[0].x, runs[1].x), "amplitude 0 changes the positions of the base model")
+        require(torch.equal(runs[0].v, runs[1].v), "amplitude 0 changes the velocities of the base model")
 
     def test_amplitude_reaches_the_motion(self) -> None:
         """The typical amplitude does something."""
         runs = [self._run({"effect": self.make(size)}) for size in (0.0, self._size(self.make(0.0)).typical)]
-        demand(torch.isfinite(runs[1].x).all(), "the typical amplitude gives no finite motion")
-        demand(not torch.equal(runs[0].x, runs[1].x), "the typical amplitude changes nothing")
+        require(torch.isfinite(runs[1].x).all(), "the typical amplitude gives no finite motion")
+        require(not torch.equal(runs[0].x, runs[1].x), "the typical amplitude changes nothing")
 
     def _run(self, effects: dict[str, AbstractEffect]) -> ClothState:
         """A few substeps of the sample, with a gripper that moves on if the effect belongs to one."""
@@ -155,7 +155,7 @@ class EffectContract(Contract):
     def test_gradients(self) -> None:
         """Sweeps in positions, velocities and every parameter."""
         effect = self._effect()
-        parameters = parameters_of(effect)
+        parameters = detached_parameters(effect)
         answers = self._answers()
 
         for name in answers(effect, **self._state()):
@@ -174,41 +174,41 @@ class EffectContract(Contract):
             leaves = {"x": x, "v": v, **dict(effect.named_parameters())}
             where = f"at rest with {'typical amplitude' if amplitude is None else 'amplitude 0'}"
             for name, answer in self._answers()(effect, x, v).items():
-                demand(torch.isfinite(answer).all(), f"{name} is not finite {where}")
+                require(torch.isfinite(answer).all(), f"{name} is not finite {where}")
                 if answer.requires_grad:
-                    finite_gradients(answer, leaves, where)
+                    require_finite_gradients(answer, leaves, where)
 
     def test_rates_bound_the_spectrum_at_rest(self) -> None:
         """A stiff or strongly damping effect must say so, or the step that the layer chooses is not stable."""
         effect = self._effect()
-        mass = self._cloth({}).model().mass.detach()
-        bounds = effect.rates(effect.coefficients(), mass)
+        mass = self._cloth({}).build_model().mass.detach()
+        bounds = effect.stability_bounds(effect.coefficients(), mass)
         pairs = zip(("omega^2", "damping rate"), bounds, (self._stiffness, self._damping), strict=True)
         for name, bound, jacobian in pairs:
             largest = float(torch.linalg.eigvals(self._rates(effect, jacobian)).real.max())
             allowed = float(bound.detach()) * (1 + 1e-9) + 1e-9
-            demand(largest <= allowed, f"rates() bounds the {name} by {allowed:.4g}, it is {largest:.4g}")
+            require(largest <= allowed, f"rates() bounds the {name} by {allowed:.4g}, it is {largest:.4g}")
 
     def test_viscous_is_the_part_of_the_force_that_it_says(self) -> None:
         """It may act in stages: linear in velocity, symmetric, never driving, within its rate; so is what is left."""
         effect, state = self._effect(), self._state()
         x, v = state["x"], state["v"]
         once, twice = (self._viscous(effect, x, factor * v).detach() for factor in (1.0, 2.0))
-        close(twice, 2 * once, 1e-12, "viscous() is not linear in velocity")
-        mass, c = self._cloth({}).model().mass.detach(), effect.coefficients()
-        whole, rate = (float(value.detach()) for value in (effect.rates(c, mass)[1], effect.viscous_rate(c, mass)))
+        require_close(twice, 2 * once, 1e-12, "viscous() is not linear in velocity")
+        mass, c = self._cloth({}).build_model().mass.detach(), effect.coefficients()
+        whole, rate = (float(value.detach()) for value in (effect.stability_bounds(c, mass)[1], effect.viscous_stability_bound(c, mass)))
         matrix = self._rates(effect, self._thickness)
-        close(matrix, matrix.mT, 1e-9, "viscous() is not symmetric")
+        require_close(matrix, matrix.mT, 1e-9, "viscous() is not symmetric")
         slowest, fastest = torch.linalg.eigvalsh(matrix)[[0, -1]].tolist()
-        demand(slowest >= -1e-9 * max(1.0, fastest), "viscous() drives some motion")
-        demand(fastest <= rate * (1 + 1e-9) + 1e-9, f"viscous_rate() says {rate:.4g}, it is {fastest:.4g}")
+        require(slowest >= -1e-9 * max(1.0, fastest), "viscous() drives some motion")
+        require(fastest <= rate * (1 + 1e-9) + 1e-9, f"viscous_stability_bound() says {rate:.4g}, it is {fastest:.4g}")
         largest = float(torch.linalg.eigvals(self._rates(effect, self._damping) - matrix).real.max())
-        demand(largest <= whole * (1 + 1e-9) - rate + 1e-9, "rates() must bound what is not viscous by the difference")
+        require(largest <= whole * (1 + 1e-9) - rate + 1e-9, "rates() must bound what is not viscous by the difference")
 
     def _rates(self, effect: AbstractEffect, jacobian: Callable[..., Tensor]) -> Tensor:
         """Minus a force's derivative at rest, over the roots of the masses on both sides."""
         x = torch.as_tensor(self.mesh().vertices)
-        root = self._cloth({}).model().mass.detach().sqrt().expand_as(x).reshape(-1)
+        root = self._cloth({}).build_model().mass.detach().sqrt().expand_as(x).reshape(-1)
         return -jacobian(effect, x, torch.zeros_like(x)).reshape(len(root), -1) / root[:, None] / root
 
     def _stiffness(self, effect: AbstractEffect, x: Tensor, v: Tensor) -> Tensor:
@@ -223,17 +223,17 @@ class EffectContract(Contract):
     def test_batches_equal_loops(self) -> None:
         """Batched states and parameters give what a loop gives."""
         effect, answers = self._effect(), self._answers()
-        parameters = parameters_of(effect)
-        many, state = batched(parameters, 3), self._state()
+        parameters = detached_parameters(effect)
+        many, state = batch_parameters(parameters, 3), self._state()
         x = torch.stack([state["x"], 1.1 * state["x"], 0.9 * state["x"]])
         v = torch.stack([state["v"], -state["v"], 2.0 * state["v"]])
         together = call_with(effect, many, answers, x, v)
         for k in range(3):
-            alone = call_with(effect, single(many, parameters, k), answers, x[k], v[k])
+            alone = call_with(effect, unbatch_parameters(many, parameters, k), answers, x[k], v[k])
             for name, answer in alone.items():
                 batch = together[name].detach()
                 batch = batch.expand(3, *batch.shape[-answer.ndim :])
-                close(batch[k], answer.detach(), 1e-12, f"{name} of batch entry {k} differs from the loop")
+                require_close(batch[k], answer.detach(), 1e-12, f"{name} of batch entry {k} differs from the loop")
 
     def test_works_in_float32(self) -> None:
         """Same answers to single precision, and no silent promotion."""
@@ -241,11 +241,11 @@ class EffectContract(Contract):
         exact = self._answers()(self._effect(), **state)
         single_state = {name: value.float() for name, value in state.items()}
         for name, got in self._answers()(self._effect().float(), **single_state).items():
-            demand(got.dtype == torch.float32, f"{name} answers float32 with {got.dtype}")
-            close(got.detach().double(), exact[name].detach(), 1e-4, f"{name} in float32")
+            require(got.dtype == torch.float32, f"{name} answers float32 with {got.dtype}")
+            require_close(got.detach().double(), exact[name].detach(), 1e-4, f"{name} in float32")
 
 
-def _cast(geometry: substep.Geometry, dtype: torch.dtype) -> substep.Geometry:
+def _cast(geometry: Geometry, dtype: torch.dtype) -> Geometry:
     def cast(value: Tensor) -> Tensor:
         return value.to(dtype)
 

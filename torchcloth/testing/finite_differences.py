@@ -11,9 +11,9 @@ from torch import Tensor
 
 from ..errors import InvalidInput
 
-STEPS = tuple(10.0 ** (-1 - k / 2) for k in range(10))
-_TINY = (1e-9, 3e-10)  # steps at which a second difference shows nothing but rounding
-_OWN_ROUNDING = 1e-12  # relative, of a derivative that was itself computed in float64
+DIFFERENCE_STEPS = tuple(10.0 ** (-1 - k / 2) for k in range(10))
+_ROUNDING_STEPS = (1e-9, 3e-10)  # steps at which a second difference shows nothing but rounding
+_DERIVATIVE_ROUNDING = 1e-12  # relative, of a derivative that was itself computed in float64
 
 
 @dataclass(frozen=True)
@@ -45,7 +45,7 @@ class Sweep:
     @property
     def floor(self) -> Tensor:
         """[N] relative error that rounding explains."""
-        return self.noise / (self.steps * self.scale) + _OWN_ROUNDING
+        return self.noise / (self.steps * self.scale) + _DERIVATIVE_ROUNDING
 
     def check(self, tolerance: float = 1e-7, slack: float = 0.2) -> float:
         """Accept the derivative, or say why not.
@@ -94,7 +94,7 @@ def finite_difference_sweep(
     point: Tensor,
     direction: Tensor,
     derivative: float | Tensor,
-    steps: Sequence[float] = STEPS,
+    steps: Sequence[float] = DIFFERENCE_STEPS,
 ) -> Sweep:
     """Central differences of ``function`` at ``point`` along ``direction``, to compare with ``derivative``.
 
@@ -121,7 +121,7 @@ def finite_difference_sweep(
         return float(out)
 
     centre = value(0.0)
-    seconds = [abs(value(h) - 2 * centre + value(-h)) for h in _TINY]
+    seconds = [abs(value(h) - 2 * centre + value(-h)) for h in _ROUNDING_STEPS]
     noise = max(*seconds, torch.finfo(torch.float64).eps * abs(centre))
     estimates = [(value(h) - value(-h)) / (2 * h) for h in ordered]
     steps64, estimates64 = (torch.tensor(values, dtype=torch.float64) for values in (ordered, estimates))
@@ -132,7 +132,7 @@ def check_gradients(
     function: Callable[..., Tensor],
     inputs: Mapping[str, Tensor],
     tolerance: float = 1e-7,
-    steps: Sequence[float] = STEPS,
+    steps: Sequence[float] = DIFFERENCE_STEPS,
     seed: int = 0,
     sizes: Mapping[str, float] | None = None,
     acts: bool = False,

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from ..materials import AbstractMaterial
 from . import samples
-from .contract import Contract, batched, call_with, close, demand, finite_gradients, float64, parameters_of, single
+from .contract import Contract, batch_parameters, call_with, require_close, require, require_finite_gradients, float64, detached_parameters, unbatch_parameters
 from .finite_differences import check_gradients, finite_difference_sweep
 
 
@@ -42,7 +42,7 @@ def return_map(material: AbstractMaterial, n: Tensor, d3: Tensor) -> Tensor:
 
 def plastic_flow(material: AbstractMaterial, f1: Tensor, f2: Tensor) -> Tensor:
     """Inelastic part [..., E, 4] of a virgin sheet that is brought to this deformation."""
-    virgin = material.start(f1.shape[-2])
+    virgin = material.initial_memory(f1.shape[-2])
     if virgin is None:
         raise AssertionError("a material without plastic set was asked for its flow")
     return _flow(material, f1, f2, virgin.to(f1))
@@ -92,7 +92,7 @@ class MaterialContract(Contract):
 
     def _laws(self) -> dict[str, tuple[Callable[..., Tensor], dict[str, Tensor]]]:
         columns, directors = self._columns(), self._directors()
-        plastic = self._material().start(self.triangles) is not None
+        plastic = self._material().initial_memory(self.triangles) is not None
         return {
             **({"plastic_flow": (plastic_flow, columns)} if plastic else {}),
             "membrane_energy": (membrane_energy, columns),
@@ -112,8 +112,8 @@ class MaterialContract(Contract):
         tangential = by_n - (by_n * n).sum(-1, keepdim=True) * n  # n has unit length: the layer drops the rest
         for name, stress in (("membrane", membrane_stress(material, f1, f2)), ("n", tangential), ("d3", by_d3)):
             largest = float(stress.detach().abs().max())
-            demand(largest <= 1e-12 * stiff, f"stress at rest ({name}): {largest:.2e} N/m beside {stiff:.2e} N/m")
-        close(return_map(material, n, n), n, 1e-14, "the return map moves a director at rest")
+            require(largest <= 1e-12 * stiff, f"stress at rest ({name}): {largest:.2e} N/m beside {stiff:.2e} N/m")
+        require_close(return_map(material, n, n), n, 1e-14, "the return map moves a director at rest")
 
     def test_stress_is_the_derivative_of_the_energy(self) -> None:
         """Membrane and director, elementwise against autograd and along a direction against a sweep."""
@@ -124,7 +124,7 @@ class MaterialContract(Contract):
             leaves = [value.clone().requires_grad_() for value in inputs.values()]
             wanted = torch.stack(torch.autograd.grad(energy(material, *leaves).sum(), leaves), dim=-2)
             got = stress(material, *inputs.values()).detach()
-            close(got, wanted, 1e-10, f"{stress.__name__} is not the derivative of {energy.__name__}")
+            require_close(got, wanted, 1e-10, f"{stress.__name__} is not the derivative of {energy.__name__}")
             point = torch.stack(list(inputs.values()), dim=-2)
             direction = samples.normal(tuple(point.shape), 9)
 
@@ -140,28 +140,28 @@ class MaterialContract(Contract):
             turned = law(material, *(value @ q.mT for value in inputs.values())).detach()
             expected = law(material, *inputs.values()).detach()
             expected = expected if name in _UNTURNED else expected @ q.mT
-            close(turned, expected, 1e-11, f"{name} changes when the frame is turned")
+            require_close(turned, expected, 1e-11, f"{name} changes when the frame is turned")
 
     def test_return_map_is_idempotent(self) -> None:
         """What has flowed once is on or inside the yield surface."""
         material, inputs = self._material(), self._directors()
         once = return_map(material, inputs["n"], inputs["d3"]).detach()
-        close(return_map(material, inputs["n"], once).detach(), once, 1e-11, "the return map is not idempotent")
+        require_close(return_map(material, inputs["n"], once).detach(), once, 1e-11, "the return map is not idempotent")
 
     def test_plastic_flow_is_idempotent(self) -> None:
         """What has set does not set again under the same deformation; elastic materials have nothing to show."""
         material, (f1, f2) = self._material(), self._columns().values()
-        virgin = material.start(self.triangles)
+        virgin = material.initial_memory(self.triangles)
         if virgin is None:
             return
         once = plastic_flow(material, f1, f2).detach()
-        demand((once != virgin).any(), "nothing yields: give ``strain`` a size that does")
-        close(_flow(material, f1, f2, once).detach(), once, 1e-12, "the plastic flow is not idempotent")
+        require((once != virgin).any(), "nothing yields: give ``strain`` a size that does")
+        require_close(_flow(material, f1, f2, once).detach(), once, 1e-12, "the plastic flow is not idempotent")
 
     def test_gradients_in_state_and_parameters(self) -> None:
         """A sweep for every law in every input and every parameter."""
         material = self._material()
-        parameters = parameters_of(material)
+        parameters = detached_parameters(material)
         for name, (law, inputs) in self._laws().items():
 
             def evaluate(law: Callable[..., Tensor] = law, keys: tuple = tuple(inputs), **values: Tensor) -> Tensor:
@@ -182,7 +182,7 @@ class MaterialContract(Contract):
             state = (f1, f2) if "f1" in inputs else (n, n)
             leaves = {key: value.clone().requires_grad_() for key, value in zip(inputs, state, strict=True)}
             result = law(material, *leaves.values())
-            finite_gradients(result, {**leaves, **dict(material.named_parameters())}, f"at rest ({name})")
+            require_finite_gradients(result, {**leaves, **dict(material.named_parameters())}, f"at rest ({name})")
 
     def test_stiffness_bounds_the_tangents_at_rest(self) -> None:
         """The stable step is built on it: no strain may be stiffer than stated, nor shear of d3."""
@@ -198,24 +198,24 @@ class MaterialContract(Contract):
             warp, weft, shear = e[:, 0, 0, None], e[:, 1, 1, None], 2 * e[:, 0, 1, None]
             allowed = bound.warp * warp**2 + bound.weft * weft**2 + bound.in_plane_shear * shear**2
             allowed = allowed + 2 * bound.coupling * warp * weft
-            demand((tangent <= allowed * (1 + 1e-5)).all(), "stiffness() is below the membrane's tangent")
+            require((tangent <= allowed * (1 + 1e-5)).all(), "stiffness() is below the membrane's tangent")
         n, aside = torch.linalg.cross(f[..., 0], f[..., 1]).unsqueeze(-2), f[..., 0].unsqueeze(-2)
         slope = director_stress(material, n, n + h * aside) - director_stress(material, n, n - h * aside)
         tangent = (slope[..., 1, :] * aside).sum(-1) / (2 * h)
-        demand((tangent <= bound.shear * (1 + 1e-5)).all(), "stiffness().shear is below the director's tangent")
+        require((tangent <= bound.shear * (1 + 1e-5)).all(), "stiffness().shear is below the director's tangent")
 
     def test_batches_equal_loops(self) -> None:
         """Batched states and parameters give what a loop gives."""
         material = self._material()
-        parameters = parameters_of(material)
-        many = batched(parameters, 3)
+        parameters = detached_parameters(material)
+        many = batch_parameters(parameters, 3)
         for name, (law, inputs) in self._laws().items():
             factor = torch.tensor([1.0, 1.01, 0.98], dtype=torch.float64)
             states = [torch.einsum("b,...->b...", factor, value) for value in inputs.values()]
             together = call_with(material, many, law, *states)
             for k in range(3):
-                alone = call_with(material, single(many, parameters, k), law, *(value[k] for value in states))
-                close(together[k].detach(), alone.detach(), 1e-12, f"{name}: batch entry {k} differs from the loop")
+                alone = call_with(material, unbatch_parameters(many, parameters, k), law, *(value[k] for value in states))
+                require_close(together[k].detach(), alone.detach(), 1e-12, f"{name}: batch entry {k} differs from the loop")
 
     def test_works_in_float32(self) -> None:
         """Same values to single precision, and no silent promotion."""
@@ -224,5 +224,5 @@ class MaterialContract(Contract):
             if name == "return_map":
                 inputs = {"n": inputs["n"], "d3": return_map(exact, *inputs.values()).detach()}
             got = law(coarse, *(value.float() for value in inputs.values())).detach()
-            demand(got.dtype == torch.float32, f"{name} answers float32 with {got.dtype}")
-            close(got.double(), law(exact, *inputs.values()).detach(), 1e-4, f"{name} in float32")
+            require(got.dtype == torch.float32, f"{name} answers float32 with {got.dtype}")
+            require_close(got.double(), law(exact, *inputs.values()).detach(), 1e-4, f"{name} in float32")

@@ -1,22 +1,39 @@
 """Particle-grid transfer: how contact passes between layers of cloth."""
 
-from .grid import FADING, GAP, RANGE, SKIN, TOUCH, TURNED, Contact, Grid
-from .transfer import Stencil, carried_momentum, lattice, push, stencil, through, velocity_gradient
+from .grid import (
+    APPROACH_PER_COMPRESSION_SPACINGS,
+    COMPRESSION_ONSET_SPACINGS,
+    FOLD_PATH_RATIO,
+    INTERACTION_RANGE_SPACINGS,
+    REST_GAP_SPACINGS,
+    SEARCH_SKIN_SPACINGS,
+    Contact,
+    Grid,
+)
+from .transfer import (
+    Stencil,
+    affine_momentum,
+    place_on_grid,
+    stencil_nodes,
+    sum_on_nodes,
+    transfer_director_forces,
+    velocity_gradient,
+)
 
 __all__ = [
-    "FADING",
-    "GAP",
-    "RANGE",
-    "SKIN",
-    "TOUCH",
-    "TURNED",
+    "APPROACH_PER_COMPRESSION_SPACINGS",
+    "REST_GAP_SPACINGS",
+    "INTERACTION_RANGE_SPACINGS",
+    "SEARCH_SKIN_SPACINGS",
+    "COMPRESSION_ONSET_SPACINGS",
+    "FOLD_PATH_RATIO",
     "Contact",
     "Grid",
     "Stencil",
-    "carried_momentum",
-    "lattice",
-    "push",
-    "stencil",
-    "through",
+    "affine_momentum",
+    "stencil_nodes",
+    "transfer_director_forces",
+    "place_on_grid",
+    "sum_on_nodes",
     "velocity_gradient",
 ]

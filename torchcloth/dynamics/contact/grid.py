@@ -13,19 +13,19 @@ from torch import Tensor
 
 from ...errors import InvalidInput
 from ...meshes import Mesh
-from .neighbours import apart, over
+from .neighbours import find_non_adjacent_triangles, find_overlapping_triangles
 
-SKIN = 2.0  # grid spacings that layers may approach each other before the search for near ones is repeated
-RANGE = 4.0  # grid spacings: the splines of points farther apart have no node of any weight in common
-TOUCH = 2.26  # grid spacings at which approaching layers begin to compress each other's directors
-FADING = 3.5  # and by how many they must approach for each unit of 1 - R33 (both measured, tests/physics/test_contact)
-GAP = 1.4  # grid spacings between layers at rest, with the default play
-SPARSEST = 1.4  # grid spacings between corners of sub-triangles: no hole between the points exceeds 0.7 spacings
-ROOM = 1.6  # times the longest way along the cloth: the extent at which the grid wraps, so that layers never alias
-MOST = 100  # points along a triangle's edge: 10 000 in it
-CROWDED = 64  # points in a triangle, of which a cloth says so; usual are 1 to 4
-UNMET = 0.5  # share of the triangles of layers that do not see the other layer, from which a cloth says so
-TURNED = 1.7  # layers are folded on each other where the way along the cloth is that much longer than through space
+SEARCH_SKIN_SPACINGS = 2.0  # grid spacings that layers may approach each other before the search for near ones is repeated
+INTERACTION_RANGE_SPACINGS = 4.0  # grid spacings: the splines of points farther apart have no node of any weight in common
+COMPRESSION_ONSET_SPACINGS = 2.26  # grid spacings at which approaching layers begin to compress each other's directors
+APPROACH_PER_COMPRESSION_SPACINGS = 3.5  # and by how many they must approach for each unit of 1 - R33 (both measured, tests/physics/test_contact)
+REST_GAP_SPACINGS = 1.4  # grid spacings between layers at rest, with the default play
+MAX_POINT_DISTANCE_SPACINGS = 1.4  # grid spacings between corners of sub-triangles: no hole between the points exceeds 0.7 spacings
+WRAP_EXTENT_FACTOR = 1.6  # times the longest way along the cloth: the extent at which the grid wraps, so that layers never alias
+MAX_POINTS_PER_EDGE = 100  # points along a triangle's edge: 10 000 in it
+WARN_POINTS_PER_TRIANGLE = 64  # points in a triangle, of which a cloth says so; usual are 1 to 4
+WARN_UNSEEN_LAYER_FRACTION = 0.5  # share of the triangles of layers that do not see the other layer, from which a cloth says so
+FOLD_PATH_RATIO = 1.7  # layers are folded on each other where the way along the cloth is that much longer than through space
 
 
 class Grid(NamedTuple):
@@ -36,41 +36,41 @@ class Grid(NamedTuple):
     nodes: int  # per axis before the grid wraps
     skin: float  # m, see SKIN
     reach: float  # m, centroids of triangles that may touch before the search is repeated
-    play: float  # compression 1 - R33 of the director before layers press
+    free_compression: float  # compression 1 - R33 of the director before layers press
     damping: float  # s
-    apart: Tensor | None  # [E, E] bool, not neighbours along the cloth; None: every triangle always takes part
+    non_adjacent: Tensor | None  # [E, E] bool, not neighbours along the cloth; None: every triangle always takes part
 
     @property
-    def longest(self) -> float:
+    def max_extent(self) -> float:
         """Extent [m] of a cloth for which there is room before the grid wraps."""
         return (self.nodes - 4) * self.spacing
 
     @property
-    def words(self) -> str:
+    def summary(self) -> str:
         """For the data sheet of a cloth."""
-        gap, unseen = 1e3 * GAP * self.spacing, 1e3 * TURNED * self.reach
+        gap, unseen = 1e3 * REST_GAP_SPACINGS * self.spacing, 1e3 * FOLD_PATH_RATIO * self.reach
         return (
             f"layers rest {gap:.3g} mm apart, unseen within {unseen:.3g} mm along the cloth; "
             f"{len(self.points)} point(s) per triangle"
         )
 
-    def doubts(self, mesh: Mesh) -> Iterator[str]:
+    def contact_warnings(self, mesh: Mesh) -> Iterator[str]:
         """What a user must know: of what contact costs, and of layers that lie over each other and do not meet."""
-        if len(self.points) >= CROWDED:
+        if len(self.points) >= WARN_POINTS_PER_TRIANGLE:
             yield (
                 f"contact: edges of some {1e3 * mesh.coarse_edge:.3g} mm take {len(self.points)} points in each "
-                f"triangle near another layer, and each costs as much as a triangle ({self.words}): give the mesh more "
+                f"triangle near another layer, and each costs as much as a triangle ({self.summary}): give the mesh more "
                 "triangles, or contact=Contact.with_gap(...) a larger gap"
             )
-        pairs = over(mesh, 2 * GAP * self.spacing)
-        if self.apart is None or not len(pairs):
+        pairs = find_overlapping_triangles(mesh, 2 * REST_GAP_SPACINGS * self.spacing)
+        if self.non_adjacent is None or not len(pairs):
             return
-        layered, seen = np.unique(pairs[:, 0]), np.unique(pairs[self.apart.cpu().numpy()[pairs[:, 0], pairs[:, 1]], 0])
+        layered, seen = np.unique(pairs[:, 0]), np.unique(pairs[self.non_adjacent.cpu().numpy()[pairs[:, 0], pairs[:, 1]], 0])
         share = 1 - len(seen) / len(layered)
-        if share > UNMET:
+        if share > WARN_UNSEEN_LAYER_FRACTION:
             yield (
                 f"contact: {100 * share:.0f} % of the triangles that lie over another layer do not see it and pass "
-                f"through ({self.words}): give contact=Contact.with_gap(...) a smaller gap, or the mesh more triangles"
+                f"through ({self.summary}): give contact=Contact.with_gap(...) a smaller gap, or the mesh more triangles"
             )
 
 
@@ -104,23 +104,23 @@ class Contact:
     spacing: float | None = None
     subdivisions: int | None = None
     damping: float = 0.1
-    play: float = 0.25
+    free_compression: float = 0.25
     everywhere: bool = False
 
     def __post_init__(self) -> None:
         if not 0 <= self.damping < float("inf"):
             raise InvalidInput("contact damping", got=f"{self.damping} s", expected="a time >= 0")
-        if not 0 <= self.play <= 0.5:
-            raise InvalidInput("contact play", got=self.play, expected="a number in [0, 0.5]")
+        if not 0 <= self.free_compression <= 0.5:
+            raise InvalidInput("contact free_compression", got=self.free_compression, expected="a number in [0, 0.5]")
 
     @classmethod
     def with_gap(cls, gap: float, **changes) -> Contact:
         """Contact whose layers rest ``gap`` [m] apart, from centre to centre; ``changes`` as for the class."""
         if not 0 < gap < float("inf"):
             raise InvalidInput("contact gap", got=f"{gap:g} m", expected="a length > 0")
-        return cls(spacing=gap / GAP, **changes)
+        return cls(spacing=gap / REST_GAP_SPACINGS, **changes)
 
-    def grid(self, mesh: Mesh) -> Grid:
+    def build_grid(self, mesh: Mesh) -> Grid:
         """Everything that mesh and contact fix, in the default precision.
 
         Raises:
@@ -128,7 +128,7 @@ class Contact:
         """
         spacing, points = self.resolve(mesh)
         corner = mesh.rest - mesh.rest.mean(1, keepdims=True)
-        reach = float((RANGE + SKIN) * spacing + 2 * np.linalg.norm(corner, axis=-1).max())
+        reach = float((INTERACTION_RANGE_SPACINGS + SEARCH_SKIN_SPACINGS) * spacing + 2 * np.linalg.norm(corner, axis=-1).max())
         longest = max(float(np.linalg.norm(np.ptp(mesh.vertices, axis=0))), mesh.extent)
         if spacing > longest:
             expected = f"at most the length of the cloth, {longest:.3g} m"
@@ -136,12 +136,12 @@ class Contact:
         return Grid(
             points=torch.as_tensor(points, dtype=torch.get_default_dtype()),
             spacing=spacing,
-            nodes=int(np.ceil(ROOM * longest / spacing)) + 6,
-            skin=SKIN * spacing,
+            nodes=int(np.ceil(WRAP_EXTENT_FACTOR * longest / spacing)) + 6,
+            skin=SEARCH_SKIN_SPACINGS * spacing,
             reach=reach,
-            play=self.play,
+            free_compression=self.free_compression,
             damping=self.damping,
-            apart=None if self.everywhere else torch.as_tensor(apart(mesh, TURNED * reach)),
+            non_adjacent=None if self.everywhere else torch.as_tensor(find_non_adjacent_triangles(mesh, FOLD_PATH_RATIO * reach)),
         )
 
     def resolve(self, mesh: Mesh) -> tuple[float, np.ndarray]:
@@ -154,20 +154,20 @@ class Contact:
         spacing = mesh.mean_edge if self.spacing is None else float(self.spacing)
         if not spacing > 0:
             raise InvalidInput("contact spacing", got=f"{spacing:g} m", expected="a length > 0")
-        if not spacing * SPARSEST * MOST >= edge:
+        if not spacing * MAX_POINT_DISTANCE_SPACINGS * MAX_POINTS_PER_EDGE >= edge:
             raise InvalidInput(
                 "contact spacing",
-                got=f"{spacing:g} m, for which a triangle needs {edge / (SPARSEST * spacing):.2g} points along an edge",
-                expected=f"{edge / (SPARSEST * MOST):.2g} m or more on this mesh",
+                got=f"{spacing:g} m, for which a triangle needs {edge / (MAX_POINT_DISTANCE_SPACINGS * spacing):.2g} points along an edge",
+                expected=f"{edge / (MAX_POINT_DISTANCE_SPACINGS * MAX_POINTS_PER_EDGE):.2g} m or more on this mesh",
                 remedy="refine the mesh, or give the grid's spacing in metres",
             )
-        needed = max(1, int(np.ceil(edge / (SPARSEST * spacing))))
+        needed = max(1, int(np.ceil(edge / (MAX_POINT_DISTANCE_SPACINGS * spacing))))
         s = needed if self.subdivisions is None else self.subdivisions
         if not isinstance(s, Real) or s % 1 != 0:
             raise InvalidInput("contact subdivisions", got=self.subdivisions, expected="a whole number")
         s = int(s)
-        if s > MOST:
-            raise InvalidInput("contact subdivisions", got=s, expected=f"at most {MOST}")
+        if s > MAX_POINTS_PER_EDGE:
+            raise InvalidInput("contact subdivisions", got=s, expected=f"at most {MAX_POINTS_PER_EDGE}")
         if s < needed:
             raise InvalidInput(
                 "contact subdivisions",

@@ -7,15 +7,15 @@ from heapq import heappop, heappush
 import numpy as np
 import torch
 
-from ..._utils.linalg import EXACT
+from ..._utils.linalg import EXACT_CDIST_MODE
 from ...meshes import Mesh
 
-BESIDE = 0.6  # mean edges, of centroids of triangles that lie over each other
-AT_ONCE = 512  # triangles whose distances from all others are in memory
-STEEP = 0.3  # height over that: of bent cloth neighbours are less
+MAX_LATERAL_OFFSET_EDGES = 0.6  # mean edges, of centroids of triangles that lie over each other
+TRIANGLES_PER_DISTANCE_BLOCK = 512  # triangles whose distances from all others are in memory
+MIN_HEIGHT_TO_OFFSET_RATIO = 0.3  # height over that: of bent cloth neighbours are less
 
 
-def apart(mesh: Mesh, distance: float) -> np.ndarray:
+def find_non_adjacent_triangles(mesh: Mesh, distance: float) -> np.ndarray:
     """[E, E] bool: the way along the rest shape between two triangles' centroids is longer than ``distance`` [m].
 
     Ways lead from triangle to triangle across shared edges (Dijkstra), so seams are crossed and gaps are not; they
@@ -54,7 +54,7 @@ def _links(mesh: Mesh) -> list[list[tuple[int, float]]]:
     return links
 
 
-def over(mesh: Mesh, gap: float) -> np.ndarray:
+def find_overlapping_triangles(mesh: Mesh, gap: float) -> np.ndarray:
     """[N, 2] triangles of which the first lies over the second as the mesh is given, nearer than ``gap`` [m].
 
     Straight over it, but for a part of an edge, and without a common vertex: no two of a smooth sheet are.
@@ -62,10 +62,10 @@ def over(mesh: Mesh, gap: float) -> np.ndarray:
     middle = mesh.vertices[mesh.faces].mean(1)
     if np.linalg.svd(middle - middle.mean(0), compute_uv=False)[-1] < 1e-9 * mesh.extent:
         return np.zeros((0, 2), dtype=int)  # flat
-    beside, places = BESIDE * mesh.mean_edge, torch.from_numpy(middle)
+    beside, places = MAX_LATERAL_OFFSET_EDGES * mesh.mean_edge, torch.from_numpy(middle)
     reach = float(np.hypot(gap, beside))
-    near = [(torch.cdist(part, places, compute_mode=EXACT) < reach).nonzero() for part in places.split(AT_ONCE)]
-    own, other = torch.cat([pairs + pairs.new_tensor([k * AT_ONCE, 0]) for k, pairs in enumerate(near)]).numpy().T
+    near = [(torch.cdist(part, places, compute_mode=EXACT_CDIST_MODE) < reach).nonzero() for part in places.split(TRIANGLES_PER_DISTANCE_BLOCK)]
+    own, other = torch.cat([pairs + pairs.new_tensor([k * TRIANGLES_PER_DISTANCE_BLOCK, 0]) for k, pairs in enumerate(near)]).numpy().T
     sides = mesh.vertices[mesh.faces[:, 1:]] - mesh.vertices[mesh.faces[:, :1]]
     normal = np.cross(sides[:, 0], sides[:, 1])
     normal /= np.linalg.norm(normal, axis=1, keepdims=True)
@@ -73,5 +73,5 @@ def over(mesh: Mesh, gap: float) -> np.ndarray:
     height = (away * normal[own]).sum(1)
     off = np.linalg.norm(away - height[:, None] * normal[own], axis=1)
     joined = (mesh.faces[own][:, :, None] == mesh.faces[other][:, None]).any((1, 2))
-    kept = (np.abs(height) < gap) & (np.abs(height) > STEEP * off) & (off < beside) & ~joined
+    kept = (np.abs(height) < gap) & (np.abs(height) > MIN_HEIGHT_TO_OFFSET_RATIO * off) & (off < beside) & ~joined
     return np.column_stack([own, other])[kept]

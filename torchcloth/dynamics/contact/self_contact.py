@@ -10,17 +10,28 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from ..._utils.linalg import EXACT, cross, dot
+from ..._utils.linalg import EXACT_CDIST_MODE, cross, dot
 from ...types import ClothState, Surface
-from ..model import Model, centroids, corners, surface
-from . import FADING, RANGE, SKIN, TOUCH, Grid, Stencil, push, stencil, velocity_gradient
+from ..kinematics import centroids, corners, surface
+from ..model import Model
+from . import (
+    APPROACH_PER_COMPRESSION_SPACINGS,
+    COMPRESSION_ONSET_SPACINGS,
+    INTERACTION_RANGE_SPACINGS,
+    SEARCH_SKIN_SPACINGS,
+    Grid,
+    Stencil,
+    place_on_grid,
+    transfer_director_forces,
+    velocity_gradient,
+)
 
 # Substeps between checkpoints of a long interval: memory ~ frames + CHUNK, one extra forward pass. Near layers are
 # searched again at each, as substeps that are computed anew start there.
-CHUNK = 48
+SUBSTEPS_PER_CHECKPOINT = 48
 
 
-class Layers(NamedTuple):
+class ContactCandidates(NamedTuple):
     """Triangles near another layer, over all scenes of the batch, while no vertex has moved far from ``x``."""
 
     active: Tensor  # [A] int64, scene E + triangle
@@ -30,7 +41,7 @@ class Layers(NamedTuple):
     x: Tensor  # [..., V, 3] m
 
 
-class Pressure(NamedTuple):
+class DirectorForces(NamedTuple):
     """What the directors of the active triangles do."""
 
     column1: Tensor  # [A, 3] N/m, reaction in the surface's columns; without it angular momentum breaks
@@ -42,57 +53,57 @@ class Pressure(NamedTuple):
 
 
 @torch.no_grad()
-def near_layers(model: Model, grid: Grid, x: Tensor, before: Layers | None = None) -> Layers:
+def find_contact_candidates(model: Model, grid: Grid, x: Tensor, previous: ContactCandidates | None = None) -> ContactCandidates:
     """Triangles whose points may meet those of another layer before a vertex has moved by half the grid's skin
     along any axis.
 
     Another layer is what is near in space but far along the cloth.
     """
-    if before is not None and float((x - before.x).abs().max()) < grid.skin / 2:
-        return before
+    if previous is not None and float((x - previous.x).abs().max()) < grid.skin / 2:
+        return previous
     x = x.detach()
     centre = centroids(model.geometry, x.reshape(-1, *x.shape[-2:]))
-    if grid.apart is None:
+    if grid.non_adjacent is None:
         near = torch.ones(centre.shape[:2], dtype=torch.bool, device=x.device)
     else:
         near = torch.stack(
-            [((torch.cdist(p, p, compute_mode=EXACT) < grid.reach) & grid.apart).any(-1) for p in centre]
+            [((torch.cdist(p, p, compute_mode=EXACT_CDIST_MODE) < grid.reach) & grid.non_adjacent).any(-1) for p in centre]
         )
     scene, triangle = near.nonzero(as_tuple=True)
     scenes, triangles = near.shape
     own = model.geometry.corners.view(3, -1).index_select(1, triangle) + scene * x.shape[-2]
     slots = torch.empty(scenes * grid.nodes**3 if len(scene) else 0, dtype=torch.int32, device=x.device)
-    return Layers(scene * triangles + triangle, scene, own, slots, x)
+    return ContactCandidates(scene * triangles + triangle, scene, own, slots, x)
 
 
-def first_directors(model: Model, grid: Grid, x: Tensor) -> Tensor:
+def initial_directors(model: Model, grid: Grid, x: Tensor) -> Tensor:
     """Directors [..., P, 3] of a cloth whose layers have come to where they are without being pressed.
 
     Layers that start within each other's splines would else have to give way by the whole play from there.
     """
     d3 = n = surface(model.geometry, x, x).n
-    if grid.apart is not None and grid.play > 0:
-        d3 = (1 - _unpressed(grid, grid.apart, centroids(model.geometry, x), n)) * n
+    if grid.non_adjacent is not None and grid.free_compression > 0:
+        d3 = (1 - _unpressed(grid, grid.non_adjacent, centroids(model.geometry, x), n)) * n
     return d3.repeat_interleave(grid.points.shape[0], dim=-2)
 
 
 def _unpressed(grid: Grid, apart: Tensor, centre: Tensor, n: Tensor) -> Tensor:
     """Compression [..., E, 1] at which layers that are as near as the triangles with these centres do not yet press."""
-    side = (grid.reach - (RANGE + SKIN) * grid.spacing) / 2
-    farthest = TOUCH * grid.spacing + side  # pairs beyond do not press, whatever their direction
+    side = (grid.reach - (INTERACTION_RANGE_SPACINGS + SEARCH_SKIN_SPACINGS) * grid.spacing) / 2
+    farthest = COMPRESSION_ONSET_SPACINGS * grid.spacing + side  # pairs beyond do not press, whatever their direction
     found = []
     for points, normals in zip(centre.reshape(-1, *n.shape[-2:]), n.reshape(-1, *n.shape[-2:]), strict=True):
         fixed = points.detach()  # which pairs; how near they are has derivatives
-        over, under = ((torch.cdist(fixed, fixed, compute_mode=EXACT) <= farthest) & apart).nonzero(as_tuple=True)
+        over, under = ((torch.cdist(fixed, fixed, compute_mode=EXACT_CDIST_MODE) <= farthest) & apart).nonzero(as_tuple=True)
         between = points[over] - points[under]
         height = dot(between, normals[under]).abs()
         beside = (dot(between, between) - height**2).clamp(min=0).sqrt() > side
-        close = ((TOUCH - height / grid.spacing) / FADING).masked_fill(beside, 0.0).clamp(0, grid.play)
+        close = ((COMPRESSION_ONSET_SPACINGS - height / grid.spacing) / APPROACH_PER_COMPRESSION_SPACINGS).masked_fill(beside, 0.0).clamp(0, grid.free_compression)
         found.append(points.new_zeros(len(points), 1).scatter_reduce(0, over.unsqueeze(-1), close, "amax"))
     return torch.stack(found).view(*n.shape[:-1], 1)
 
 
-def pressure(model: Model, grid: Grid, layers: Layers, state: ClothState, s: Surface, dt: float) -> Pressure:
+def compute_director_forces(model: Model, grid: Grid, layers: ContactCandidates, state: ClothState, s: Surface, dt: float) -> DirectorForces:
     """Split the director's stress into what acts on the surface columns (through n) and on d3 itself.
 
     The collision's damping knows the rate of closing from the substep before; divided as if it were implicit, it stays
@@ -103,24 +114,24 @@ def pressure(model: Model, grid: Grid, layers: Layers, state: ClothState, s: Sur
     d3 = state.d3.reshape(-1, count, 3).index_select(0, layers.active)
     normal = n.unsqueeze(-2)
     by_normal, by_director = model.material.director_stress(
-        per_point(model, layers, s), normal, d3 + grid.play * normal
+        coefficients_per_point(model, layers, s), normal, d3 + grid.free_compression * normal
     )
-    by_normal = by_normal + grid.play * by_director
+    by_normal = by_normal + grid.free_compression * by_director
     closing = state.memory["contact"].reshape(-1, count, 1).index_select(0, layers.active)
     press = dot(by_director, normal).clamp(max=0)
     density = _pick(layers, model.areal_density, s.n).unsqueeze(-2)
-    slowed = 1 - (2 * dt * grid.damping / (FADING * grid.spacing) ** 2) * press / density
+    slowed = 1 - (2 * dt * grid.damping / (APPROACH_PER_COMPRESSION_SPACINGS * grid.spacing) ** 2) * press / density
     loss = press * (grid.damping * closing / slowed).clamp(min=-1)
     by_normal, by_director = by_normal + loss * d3, by_director + loss * normal
     turn = by_normal.sum(-2) / count
     turn = (turn - dot(turn, n) * n) / J  # n has unit length: only its tangential change is real
     pull = (area.unsqueeze(-2) / count) * by_director
     mass = _each(_pick(layers, model.areal_density * s.area, s.n) / count, count)
-    nodes = stencil(_points(grid, layers, state.x), mass, _each(layers.scene, count), grid, layers.slots)
-    return Pressure(cross(f2, turn), cross(turn, f1), pull.flatten(0, 1), d3.flatten(0, 1), mass, nodes)
+    nodes = place_on_grid(_points(grid, layers, state.x), mass, _each(layers.scene, count), grid, layers.slots)
+    return DirectorForces(cross(f2, turn), cross(turn, f1), pull.flatten(0, 1), d3.flatten(0, 1), mass, nodes)
 
 
-def add_columns(layers: Layers, columns: tuple[Tensor, Tensor], p: Pressure) -> tuple[Tensor, Tensor]:
+def add_director_stress(layers: ContactCandidates, columns: tuple[Tensor, Tensor], p: DirectorForces) -> tuple[Tensor, Tensor]:
     """Membrane stress columns [..., E, 3] with the directors' reaction."""
     first, second = (
         column.reshape(-1, 3).index_add(0, layers.active, extra).view(column.shape)
@@ -129,14 +140,14 @@ def add_columns(layers: Layers, columns: tuple[Tensor, Tensor], p: Pressure) -> 
     return first, second
 
 
-def repulsion(model: Model, grid: Grid, layers: Layers, p: Pressure, s: Surface, like: Tensor, dt: float) -> Tensor:
+def contact_velocity_change(model: Model, grid: Grid, layers: ContactCandidates, p: DirectorForces, s: Surface, like: Tensor, dt: float) -> Tensor:
     """Change of the vertices' velocities [..., V, 3] m/s by contact.
 
     The exact transpose of how vertices carry velocity to the nodes, with the affine part: momentum and its moment are
     kept to rounding, and contact is as symmetric as elasticity.
     """
     count = grid.points.shape[0]
-    change, moment = push(p.nodes, p.pull, p.d3, grid.spacing, dt)
+    change, moment = transfer_director_forces(p.nodes, p.pull, p.d3, grid.spacing, dt)
     momentum = (p.mass * change).unflatten(0, (-1, count))
     shares = torch.stack([(grid.points[:, corner, None] * momentum).sum(-2) for corner in range(3)])
     shares = shares + _affine_shares(model, layers, s, (p.mass.unsqueeze(-1) * moment).unflatten(0, (-1, count)).sum(1))
@@ -144,7 +155,7 @@ def repulsion(model: Model, grid: Grid, layers: Layers, p: Pressure, s: Surface,
     return total.view(like.shape) / model.mass
 
 
-def _affine_shares(model: Model, layers: Layers, s: Surface, moment: Tensor) -> Tensor:
+def _affine_shares(model: Model, layers: ContactCandidates, s: Surface, moment: Tensor) -> Tensor:
     """Impulses [3, A, 3] N s at the corners: the transpose of ``_mesh_gradient`` applied to ``moment`` [A, 3, 3]."""
     n, J, dual1, dual2 = (_pick(layers, field, s.n) for field in (s.n, s.J, s.cofactor1, s.cofactor2))
     dual1, dual2 = dual1 / J, dual2 / J
@@ -160,8 +171,8 @@ def _times(matrix: Tensor, vector: Tensor) -> Tensor:
     return (matrix @ vector.unsqueeze(-1)).squeeze(-1)
 
 
-def follow(
-    model: Model, grid: Grid, layers: Layers, p: Pressure | None, s: Surface, v: Tensor, now: Surface, dt: float
+def advance_directors(
+    model: Model, grid: Grid, layers: ContactCandidates, p: DirectorForces | None, s: Surface, v: Tensor, now: Surface, dt: float
 ) -> tuple[Tensor, Tensor]:
     """Directors [..., P, 3] carried by the velocities v that the cloth got and mapped back, and how fast they close.
 
@@ -181,8 +192,8 @@ def follow(
     before, after = (field.unflatten(0, (-1, count)) for field in (p.d3, moved))
     old, n = (_pick(layers, field, field).unsqueeze(-2) for field in (s.n, now.n))
     height = dot(after, n)
-    mapped = model.material.return_map(per_point(model, layers, s), n, after + grid.play * n) - grid.play * n
-    mapped = torch.where(height > 1 - grid.play, height.clamp(max=1) * n, mapped)
+    mapped = model.material.return_map(coefficients_per_point(model, layers, s), n, after + grid.free_compression * n) - grid.free_compression * n
+    mapped = torch.where(height > 1 - grid.free_compression, height.clamp(max=1) * n, mapped)
     rate = (dot(before, old) - height) / dt
     return _put(layers, d3, mapped), _put(layers, closing, rate)
 
@@ -192,7 +203,7 @@ def director_energy(model: Model, grid: Grid, s: Surface, d3: Tensor) -> Tensor:
     count = grid.points.shape[0]
     c = type(model.coefficients)(*(k.unsqueeze(-2) for k in model.coefficients))
     n = s.n.unsqueeze(-2)
-    density = model.material.director_energy(c, n, d3.unflatten(-2, (-1, count)) + grid.play * n)
+    density = model.material.director_energy(c, n, d3.unflatten(-2, (-1, count)) + grid.free_compression * n)
     return (s.area.unsqueeze(-2) / count * density).sum((-3, -2, -1))
 
 
@@ -210,13 +221,13 @@ def _mesh_gradient(model: Model, v: Tensor, s: Surface) -> Tensor:
     return left @ right.mT
 
 
-def _pick(layers: Layers, field: Tensor, like: Tensor) -> Tensor:
+def _pick(layers: ContactCandidates, field: Tensor, like: Tensor) -> Tensor:
     """Rows [A, K] of a field [..., E or 1, K] at the active triangles; ``like`` is [..., E, 3]."""
     full = field.expand(*like.shape[:-1], field.shape[-1])
     return full.reshape(-1, field.shape[-1]).index_select(0, layers.active)
 
 
-def _put(layers: Layers, field: Tensor, rows: Tensor) -> Tensor:
+def _put(layers: ContactCandidates, field: Tensor, rows: Tensor) -> Tensor:
     """The field [..., P, K] with the rows [A, S, K] of the active triangles replaced."""
     return field.reshape(-1, *rows.shape[1:]).index_copy(0, layers.active, rows).view(field.shape)
 
@@ -226,13 +237,13 @@ def _each(rows: Tensor, count: int) -> Tensor:
     return rows.repeat_interleave(count, 0)
 
 
-def _points(grid: Grid, layers: Layers, field: Tensor) -> Tensor:
+def _points(grid: Grid, layers: ContactCandidates, field: Tensor) -> Tensor:
     """Values [A S, 3] at the contact points of the active triangles."""
     own = field.reshape(-1, 3).index_select(0, layers.vertices.flatten()).unflatten(0, (3, -1))
     return torch.einsum("sc,cak->ask", grid.points, own).flatten(0, 1)
 
 
-def per_point(model: Model, layers: Layers, s: Surface) -> Any:
+def coefficients_per_point(model: Model, layers: ContactCandidates, s: Surface) -> Any:
     """The material's coefficients at the active triangles, with an axis for the contact points."""
     coefficients = model.coefficients
     return type(coefficients)(*(_pick(layers, c, s.n).unsqueeze(-2) for c in coefficients))

@@ -18,13 +18,13 @@ class Stencil(NamedTuple):
     """The 27 nodes around each point."""
 
     weight: Tensor  # [P, 27]
-    slope: Tensor  # [P, 27, 3] 1/m, gradient of the weight
+    weight_gradient: Tensor  # [P, 27, 3] 1/m, gradient of the weight
     offset: Tensor  # [P, 3] grid spacings, from the lowest node
     node: Tensor  # [27 P] int64, rows of a grid that holds only the nodes that are touched
-    inverse: Tensor  # [P, 27] 1/kg, one over the mass on the node
+    inverse_mass: Tensor  # [P, 27] 1/kg, one over the mass on the node
 
 
-def stencil(position: Tensor, mass: Tensor, scene: Tensor, grid: Grid, slots: Tensor) -> Stencil:
+def place_on_grid(position: Tensor, mass: Tensor, scene: Tensor, grid: Grid, slots: Tensor) -> Stencil:
     """Place points on the grid.
 
     Args:
@@ -39,12 +39,12 @@ def stencil(position: Tensor, mass: Tensor, scene: Tensor, grid: Grid, slots: Te
     offset = scaled - base  # in [0.5, 1.5)
     weight, slope = _splines(offset, grid.spacing)
     node = _compact(_node_index(base.long(), scene, grid.nodes).reshape(-1), slots)
-    total = through(node, mass * weight)
+    total = sum_on_nodes(node, mass * weight)
     least = torch.finfo(total.dtype).tiny ** 0.5  # kg; a weight may be 0, and the derivative of 1 / 1e-20 kg overflows
     return Stencil(weight, slope, offset, node, 1.0 / torch.where(total > least, total, 1.0))
 
 
-def push(nodes: Stencil, pull: Tensor, director: Tensor, spacing: float, dt: float) -> tuple[Tensor, Tensor]:
+def transfer_director_forces(nodes: Stencil, pull: Tensor, director: Tensor, spacing: float, dt: float) -> tuple[Tensor, Tensor]:
     """What the directors' forces -pull (d3 . grad w) on the nodes do to the points: the transpose of how they carry.
 
     Args:
@@ -57,10 +57,10 @@ def push(nodes: Stencil, pull: Tensor, director: Tensor, spacing: float, dt: flo
     Returns:
         (change of each point's velocity [P, 3] m/s, its moment about the point: change (x) arm [P, 3, 3] m^2/s)
     """
-    force = -(nodes.slope @ director.unsqueeze(-1)) * pull.unsqueeze(-2)
-    change = dt * through(nodes.node, force) * nodes.inverse.unsqueeze(-1)
+    force = -(nodes.weight_gradient @ director.unsqueeze(-1)) * pull.unsqueeze(-2)
+    change = dt * sum_on_nodes(nodes.node, force) * nodes.inverse_mass.unsqueeze(-1)
     weighted = nodes.weight.unsqueeze(-1) * change
-    arm = (lattice(director) - nodes.offset.unsqueeze(-2)) * spacing
+    arm = (stencil_nodes(director) - nodes.offset.unsqueeze(-2)) * spacing
     return weighted.sum(-2), weighted.mT @ arm
 
 
@@ -74,25 +74,25 @@ def velocity_gradient(nodes: Stencil, mass: Tensor, velocity: Tensor, affine: Te
         affine: [P, 3, 3] 1/s, velocity gradient at each point, derived from the mesh.
         spacing: grid spacing [m].
     """
-    momentum = carried_momentum(nodes, mass, velocity, affine, spacing)
-    return (through(nodes.node, momentum) * nodes.inverse.unsqueeze(-1)).mT @ nodes.slope
+    momentum = affine_momentum(nodes, mass, velocity, affine, spacing)
+    return (sum_on_nodes(nodes.node, momentum) * nodes.inverse_mass.unsqueeze(-1)).mT @ nodes.weight_gradient
 
 
-def carried_momentum(nodes: Stencil, mass: Tensor, velocity: Tensor, affine: Tensor, spacing: float) -> Tensor:
+def affine_momentum(nodes: Stencil, mass: Tensor, velocity: Tensor, affine: Tensor, spacing: float) -> Tensor:
     """What each point gives to its nodes [P, 27, 3] kg m/s: its mass times the affine velocity field around it."""
     spread = spacing * affine
     lowest = velocity - (spread @ nodes.offset.unsqueeze(-1)).squeeze(-1)  # the affine field at the lowest node
-    carried = lowest.unsqueeze(-2) + lattice(velocity) @ spread.mT
+    carried = lowest.unsqueeze(-2) + stencil_nodes(velocity) @ spread.mT
     return (mass * nodes.weight).unsqueeze(-1) * carried
 
 
-def lattice(like: Tensor) -> Tensor:
+def stencil_nodes(like: Tensor) -> Tensor:
     """[27, 3] grid spacings, the nodes of a stencil from its lowest one."""
     step = torch.arange(3, dtype=like.dtype, device=like.device)
     return torch.cartesian_prod(step, step, step)
 
 
-def through(node: Tensor, field: Tensor) -> Tensor:
+def sum_on_nodes(node: Tensor, field: Tensor) -> Tensor:
     """Sum on the nodes, seen from each point again: [P, 27, ...] -> [P, 27, ...]."""
     flat = field.flatten(0, 1)
     return torch.zeros_like(flat).index_add(0, node, flat).index_select(0, node).view(field.shape)
