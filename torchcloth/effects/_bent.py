@@ -43,8 +43,8 @@ class BendingStencil(nn.Module):
 
     def __init__(self) -> None:
         super().__init__()
-        for name in ("near", "weight", "area", "bending_bound", "turning_bound"):
-            like = torch.long if name == "near" else None
+        for name in ("neighbours", "weight", "area", "bending_bound", "turning_bound"):
+            like = torch.long if name == "neighbours" else None
             self.register_buffer(name, torch.zeros(0, dtype=like), persistent=False)
         self.neighbours: Tensor  # [N, V] neighbours that a vertex's derivatives are fitted to
         self.weight: Tensor  # [5, N, V, 1] 1/m^2 (three), 1/m (two)
