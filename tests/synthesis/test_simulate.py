@@ -11,9 +11,9 @@ from torchcloth import cli, recordings, robots
 from torchcloth.boundaries.motion import interpolate_poses
 from torchcloth.identification import build_cloth, build_episode
 from torchcloth.losses import chamfer_to_surface
-from torchcloth.observe import DepthCamera, decode, to_points
+from torchcloth.observe import DepthCamera, decode_depth, to_points
 from torchcloth.parameters import PhysicalParameter
-from torchcloth.synthesis import episodes
+from torchcloth.synthesis import generate
 
 SMALL = ["--triangles", "98", "--rate", "6"]
 EPISODE = "sheet_stretch"
@@ -37,7 +37,7 @@ def recording(folder):
 
 def test_what_is_missing_is_said_before_anything_is_simulated(tmp_path, monkeypatch, capsys):
     monkeypatch.setitem(sys.modules, "open3d", None)
-    monkeypatch.setattr(episodes, "perform", lambda *_: pytest.fail("simulated"))
+    monkeypatch.setattr(generate, "plan_and_simulate", lambda *_: pytest.fail("simulated"))
     assert simulate(tmp_path / "out") == 2
     assert "depth cameras and clouds need open3d" in capsys.readouterr().err
 
@@ -61,8 +61,8 @@ def test_held_vertices_follow_the_replayed_joints(recording):
     times = torch.as_tensor(recording.truth.t)
     for name, grasp in recording.grasps.items():
         pose = interpolate_poses(motion[name], times).numpy()
-        held = recording.truth.vertices[:, grasp.vertices]
-        local = np.einsum("tba,tvb->tva", pose[:, :3, :3], held - pose[:, None, :3, 3])
+        gripped = recording.truth.vertices[:, grasp.vertices]
+        local = np.einsum("tba,tvb->tva", pose[:, :3, :3], gripped - pose[:, None, :3, 3])
         assert np.abs(local - local[0]).max() < 2e-5
         assert np.abs(local[0]).max() < 0.08, "near the tool"
 
@@ -87,20 +87,20 @@ def test_points_lie_on_the_cloth(recording):
 
 def test_depth_images_show_arms_table_and_cloth(recording):
     camera = recording.cameras["cam0"]
-    depth = decode(camera.depth.load(0), camera.depth_scale)
-    seen = to_points(DepthCamera.of(camera), depth)
+    depth = decode_depth(camera.depth.load(0), camera.depth_scale)
+    points = to_points(DepthCamera.from_recording(camera), depth)
     assert (depth > 0).mean() > 0.4
-    table = (np.abs(seen[:, 2]) < 0.01) & (seen[:, 0] > 0.25)
-    arm = np.linalg.norm(seen[:, :2] - [0.0, 0.316], axis=1) < 0.1
+    table = (np.abs(points[:, 2]) < 0.01) & (points[:, 0] > 0.25)
+    arm = np.linalg.norm(points[:, :2] - [0.0, 0.316], axis=1) < 0.1
     assert table.sum() > 5000
     assert arm.sum() > 500
 
 
 def test_identification_takes_it(recording):
     cloth = build_cloth(recording)
-    taken = build_episode(cloth, recording)
-    assert len(taken.clouds) == len(recording.points)
-    assert set(taken.motion) == {"left", "right"}
+    episode = build_episode(cloth, recording)
+    assert len(episode.clouds) == len(recording.points)
+    assert set(episode.motion) == {"left", "right"}
 
 
 def test_a_fit_starts_from_the_model_that_made_it_but_for_a_stiffer_membrane(recording):
@@ -115,10 +115,10 @@ def test_a_fit_starts_from_the_model_that_made_it_but_for_a_stiffer_membrane(rec
 
 
 def test_a_finished_episode_is_not_made_again(folder, capsys):
-    made = (folder / EPISODE / "episode.json").stat().st_mtime_ns
+    recording = (folder / EPISODE / "episode.json").stat().st_mtime_ns
     assert simulate(folder) == 0
     assert "existed" in capsys.readouterr().out
-    assert (folder / EPISODE / "episode.json").stat().st_mtime_ns == made
+    assert (folder / EPISODE / "episode.json").stat().st_mtime_ns == recording
 
 
 def test_an_episode_of_another_order_is_refused(folder, capsys):
@@ -128,11 +128,11 @@ def test_an_episode_of_another_order_is_refused(folder, capsys):
 
 def test_grippers_alone_go_as_fast_as_asked(tmp_path):
     assert simulate(tmp_path, "--grippers-only", "--no-pictures", "--camera", "d435", "--seed", "3") == 0
-    made = recordings.read(tmp_path / f"{EPISODE}_seed3", with_truth=True)
-    assert not made.joints
-    assert not made.robots
-    assert made.cameras["cam0"].width == 848
-    motion = robots.replay(made)
+    recording = recordings.read(tmp_path / f"{EPISODE}_seed3", with_truth=True)
+    assert not recording.joints
+    assert not recording.robots
+    assert recording.cameras["cam0"].width == 848
+    motion = robots.replay(recording)
     assert set(motion) == {"left", "right"}
     assert float(motion["left"].t[-1]) == pytest.approx(4 * 0.3 + 0.3)
     assert not list(tmp_path.glob("*.gif"))
@@ -174,7 +174,7 @@ def test_an_interruption_leaves_no_half_episode(tmp_path, capsys, monkeypatch):
 
     monkeypatch.setattr("torchcloth.synthesis.generate.capture", stop)
     assert simulate(tmp_path, "--grippers-only") == 130
-    assert "the same command goes on" in capsys.readouterr().err
+    assert "the same command continues" in capsys.readouterr().err
     assert list(tmp_path.iterdir()) == []
 
 
@@ -183,16 +183,16 @@ def test_nine_in_one_command(tmp_path):
     """Three garments by three motions at their defaults: about 10 minutes on one core."""
     command = ["simulate", "--garment", "shirt", "trousers", "dress", "--motion", "cover", "fling", "drag"]
     assert cli.main([*command, "--out", str(tmp_path)]) == 0
-    episodes = sorted(path for path in tmp_path.iterdir() if path.is_dir())
-    assert len(episodes) == 9
-    for path in episodes:
-        made = recordings.read(path, with_truth=True)
-        x = made.truth.vertices
+    generate = sorted(path for path in tmp_path.iterdir() if path.is_dir())
+    assert len(generate) == 9
+    for path in generate:
+        recording = recordings.read(path, with_truth=True)
+        x = recording.truth.vertices
         assert x[..., 2].min() > -1e-3, "nothing under the table"
         assert np.ptp(x, axis=1).max() < 1.3, "whole"
-        motion = next(iter(made.joints.values()))
+        motion = next(iter(recording.joints.values()))
         released = motion.t[~motion.closed][0]
-        after = made.truth.t > released + 0.5
+        after = recording.truth.t > released + 0.5
         assert np.abs(np.diff(x[after], axis=0)).max() * 15 < 0.6, "it comes to rest"
-        order = json.loads((path / "episode.json").read_text())["order"]
-        assert (order["garment"], order["motion"]) == tuple(path.name.split("_"))
+        spec = json.loads((path / "episode.json").read_text())["order"]
+        assert (spec["garment"], spec["motion"]) == tuple(path.name.split("_"))

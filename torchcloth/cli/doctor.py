@@ -50,10 +50,10 @@ def _doctor(options: argparse.Namespace) -> int:
 
 def _open3d_status() -> str:
     from ..errors import MissingDependency
-    from ..observe.render import open3d_or_refuse
+    from ..observe.render import import_open3d
 
     try:
-        open3d_or_refuse()
+        import_open3d()
     except MissingDependency as error:
         return f"cannot be imported: {error.got}; {error.remedy}"
     return "installed"

@@ -25,7 +25,7 @@ from .output_paths import (
 
 if TYPE_CHECKING:
     from ..cloth import Cloth
-    from ..diagnosis import Model
+    from ..diagnosis import WorldModel
     from ..identification import Identification
     from ..identification.fields import FieldFit
     from ..recordings import Recording
@@ -153,7 +153,7 @@ def _identify(options: argparse.Namespace) -> int:
 
     from .. import recordings
     from ..identification import Identification
-    from ..recordings.consistency import together
+    from ..recordings.consistency import merge_scene
 
     torch.set_default_dtype(torch.float64)  # sensitivities lose digits over thousands of substeps in float32
     torch.set_num_threads(1)  # on meshes of a thousand triangles a second thread costs more than it gains
@@ -161,7 +161,7 @@ def _identify(options: argparse.Namespace) -> int:
     check_output_folder(options.out)
     identify_fields.check(options, _default_options())
     episodes = [recordings.read(path) for path in options.episodes]
-    cloth, notes = _cloth(options, together(episodes))
+    cloth, notes = _cloth(options, merge_scene(episodes))
     for note in notes:
         print(f"note: {note}")
     size = f"{len(episodes)} episode(s), {len(cloth.mesh.faces)} triangles"
@@ -210,10 +210,10 @@ def _cloth_from_model(options: argparse.Namespace, recording: Recording) -> tupl
     if options.contact is not None:
         raise InvalidInput("--contact", got="it and --model", expected="one of them")
     file = diagnosis.read_model(options.model, recording)
-    return file.model.world().cloth.requires_grad_(True), describe_causes_outside_cloth(file.model)
+    return file.model.build_world().cloth.requires_grad_(True), describe_causes_outside_cloth(file.model)
 
 
-def describe_causes_outside_cloth(model: Model) -> list[str]:
+def describe_causes_outside_cloth(model: WorldModel) -> list[str]:
     """Return notes on causes of a model that belong to robot or camera, which a cloth cannot hold."""
     from .. import diagnosis
 
@@ -325,13 +325,13 @@ def _report(options: argparse.Namespace, fit: Identification, cloth: Cloth, reco
     from .._utils.resume import clear_store
     from ..identification import build_episode
     from ..identification.io.saved_fit import RESULT
-    from ..identification.pictures import draw
+    from ..identification.pictures import save_fit_pictures
     from ..identification.tables import print_fit
 
     folder = options.out
     note = replacement_note(folder / RESULT)
     path = fit.save(folder, options.model)
-    pictures = draw(fit, [build_episode(cloth, r) for r in recordings], cloth.mesh.faces, folder)
+    pictures = save_fit_pictures(fit, [build_episode(cloth, r) for r in recordings], cloth.mesh.faces, folder)
     clear_store(folder / PROGRESS_FOLDER_NAME)
     print_fit(fit)
     print(f"result:   {path}{note}")

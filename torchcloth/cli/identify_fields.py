@@ -114,11 +114,11 @@ def report(folder: Path, fit: FieldFit, cloth: Cloth) -> int:
 
     from .._utils.resume import clear_store
     from ..identification.fields import RESULT
-    from ..identification.pictures import field_maps, save_figure
+    from ..identification.pictures import plot_fields, save_figure
 
     note = replacement_note(folder / RESULT)
     path = fit.save(folder)
-    picture = save_figure(field_maps(fit.fields, cloth), folder / "fields.png")
+    picture = save_figure(plot_fields(fit.fields, cloth), folder / "fields.png")
     clear_store(folder / PROGRESS_FOLDER_NAME)  # before anything is printed, to somebody who may stop reading
     table = Table(title=f"{len(cloth.mesh.faces)} triangles", title_justify="left", box=box.SIMPLE_HEAD)
     for heading in ("field", "median", "5 %", "95 %", "unit"):

@@ -13,7 +13,7 @@ from .output_paths import check_output_folder, check_outside_episodes, output_pa
 
 if TYPE_CHECKING:
     from ..cloth import Cloth
-    from ..diagnosis import Model
+    from ..diagnosis import WorldModel
     from ..recordings import Recording
 
 PANEL_SIZE_PX = (520, 440)  # of each of the four frames in plan.png
@@ -138,16 +138,16 @@ def _plan(options: argparse.Namespace) -> int:
     replacement = replacement_note(options.out / PLAN_FILE)
     files = result.save(options.out)
     clear_store(options.out / PROGRESS_FOLDER_NAME)
-    picture = viewing.picture(viewing.film_of_plan(result, goal), options.out / "plan.png", size=PANEL_SIZE_PX)
+    picture = viewing.write_png(viewing.film_from_plan(result, goal), options.out / "plan.png", size=PANEL_SIZE_PX)
     planning.print_plan(result)
     print("result: " + ", ".join(str(path) for path in (*files, picture)) + replacement)
     return 0
 
 
-def _models(options: argparse.Namespace, recording: Recording) -> list[Cloth] | list[Model]:
+def _models(options: argparse.Namespace, recording: Recording) -> list[Cloth] | list[WorldModel]:
     """Return the models to plan with: the best estimate first, then samples of the posterior."""
     from .. import diagnosis
-    from ..identification import build_cloth, drawn
+    from ..identification import build_cloth, sample_posterior
 
     if options.samples < 1:
         raise InvalidInput("--samples", got=options.samples, expected="1 or more")
@@ -157,7 +157,7 @@ def _models(options: argparse.Namespace, recording: Recording) -> list[Cloth] | 
         return [build_cloth(recording)]
     if options.fit.suffix == ".tcm":
         return diagnosis.drawn_models(diagnosis.read_model(options.fit, recording), options.samples)
-    return drawn(options.fit, recording, options.samples, begun=diagnosis.start_of(options.fit))
+    return sample_posterior(options.fit, recording, options.samples, build_start=diagnosis.start_of(options.fit))
 
 
 def _progress_text(number: int, distance: float, best: float) -> str:

@@ -83,8 +83,8 @@ def _pose(options: argparse.Namespace) -> int:
     estimate = _estimate(options, cloth, uncertain, recording)
     note = replacement_note(options.out / "pose.json")
     files = estimate.save(options.out)
-    film = viewing.film_of_pose(recording, estimate, truth=options.truth)
-    picture = viewing.picture(film, options.out / "pose.png", size=PANEL_SIZE_PX)
+    film = viewing.film_from_pose(recording, estimate, truth=options.truth)
+    picture = viewing.write_png(film, options.out / "pose.png", size=PANEL_SIZE_PX)
     print_pose(estimate)
     if options.fit is not None and _was_fitted_to(options.fit, recording):
         print("note: the fit used this episode. It counts twice, so the fabric's standard errors are too small")
@@ -95,23 +95,23 @@ def _pose(options: argparse.Namespace) -> int:
 def _was_fitted_to(fit: Path, recording: Recording) -> bool:
     """Whether the fit or model was fitted to this episode."""
     from .. import diagnosis
-    from ..identification import is_fitted
+    from ..identification import is_fitted_episode
 
-    return diagnosis.was_fitted(fit, recording) if fit.suffix == ".tcm" else is_fitted(fit, recording)
+    return diagnosis.was_fitted(fit, recording) if fit.suffix == ".tcm" else is_fitted_episode(fit, recording)
 
 
 def _model(options: argparse.Namespace, recording: Recording) -> tuple[Cloth, dict[str, tuple[float, float]]]:
     """Return the cloth, and value and spread of each uncertain parameter."""
     from ..diagnosis import start_of
     from ..episodes.unknowns import find_scalar_parameters
-    from ..identification import build_cloth, fitted
+    from ..identification import build_cloth, load_fitted_cloth
 
     if options.fit is None:
         cloth, uncertain = build_cloth(recording), {}
     elif options.fit.suffix == ".tcm":
         cloth, uncertain = _cloth_from_model(options.fit, recording)
     else:
-        cloth, uncertain = fitted(options.fit, recording, start_of(options.fit))
+        cloth, uncertain = load_fitted_cloth(options.fit, recording, start_of(options.fit))
     names = find_scalar_parameters(cloth)
     for name, spread in parse_assignments(options.uncertainty, "--uncertainty").items():
         if name not in names:
@@ -126,7 +126,7 @@ def _cloth_from_model(path: Path, recording: Recording) -> tuple[Cloth, dict[str
     file = diagnosis.read_model(path, recording)
     for note in describe_causes_outside_cloth(file.model):
         print(f"note: {note}")
-    return file.model.world().cloth, diagnosis.uncertain(file)
+    return file.model.build_world().cloth, diagnosis.uncertain(file)
 
 
 def _estimate(

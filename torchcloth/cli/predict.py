@@ -95,10 +95,10 @@ def _predict(options: argparse.Namespace) -> int:
 
 
 def _predict_strip(fit: Path, out: Path, options: argparse.Namespace) -> int:
-    from ..identification import pictures, predict_tension, prediction_report, read_model, specimen_like
+    from ..identification import make_specimen, pictures, predict_tension, prediction_report, read_tension_model
     from ..recordings import read_tension
 
-    model, strip_values = read_model(fit), (options.length, options.width, options.preload, options.strain)
+    model, strip_values = read_tension_model(fit), (options.length, options.width, options.preload, options.strain)
     if options.data is not None:
         if options.angle is not None or any(number is not None for number in strip_values):
             raise InvalidInput("DATA", got="a table and a strip's numbers", expected="one of them")
@@ -107,11 +107,11 @@ def _predict_strip(fit: Path, out: Path, options: argparse.Namespace) -> int:
         raise InvalidInput("--angle", got="none", expected="degrees from the warp, or the folder of a table")
     else:
         size = dict(zip(("length", "width", "preload", "strain"), strip_values, strict=True))
-        prediction = predict_tension(model, *specimen_like(model, math.radians(options.angle), **size))
+        prediction = predict_tension(model, *make_specimen(model, math.radians(options.angle), **size))
     note = replacement_note(out / RESULT)
     path = _write(out, prediction.as_dict())
-    picture = pictures.save_figure(prediction_report.strip(prediction), out / "prediction.png")
-    prediction_report.print_strip(prediction)
+    picture = pictures.save_figure(prediction_report.plot_tension_prediction(prediction), out / "prediction.png")
+    prediction_report.print_tension_prediction(prediction)
     print(f"result:   {path}{note}\npicture:  {picture}")
     return 0
 
@@ -122,7 +122,7 @@ def _predict_episode(fit: Path, out: Path, options: argparse.Namespace) -> int:
     from .. import recordings
     from .._utils.files import write_atomically
     from ..diagnosis import predicted, start_of, was_fitted
-    from ..identification import is_fitted, pictures, predict_episode, prediction_report
+    from ..identification import is_fitted_episode, pictures, predict_episode, prediction_report
 
     if options.data is None:
         raise InvalidInput("DATA", got="none", expected="an episode whose motion is to be predicted")
@@ -132,12 +132,14 @@ def _predict_episode(fit: Path, out: Path, options: argparse.Namespace) -> int:
     note = replacement_note(out / RESULT)
     path = _write(out, prediction.as_dict())
     with write_atomically(out / "prediction.npz") as file:
-        t, vertices, std = (part.numpy() for part in (prediction.episode.times, prediction.frames.x, prediction.std))
-        interval, faces = prediction.interval.numpy(), prediction.cloth.mesh.faces
+        t, vertices, std = (
+            part.numpy() for part in (prediction.episode.times, prediction.frames.x, prediction.vertex_std)
+        )
+        interval, faces = prediction.half_width.numpy(), prediction.cloth.mesh.faces
         np.savez_compressed(file, t=t, vertices=vertices, std=std, interval=interval, faces=faces)
-    picture = pictures.save_figure(prediction_report.predicted(prediction), out / "prediction.png")
-    prediction_report.print_predicted(prediction)
-    if was_fitted(fit, recording) if of_model else is_fitted(fit, recording):
+    picture = pictures.save_figure(prediction_report.plot_episode_prediction(prediction), out / "prediction.png")
+    prediction_report.print_episode_prediction(prediction)
+    if was_fitted(fit, recording) if of_model else is_fitted_episode(fit, recording):
         print("note: the fit used this episode, so its distances are residuals and not prediction errors")
     print(f"result:   {path}{note}\nframes:   {out / 'prediction.npz'}\npicture:  {picture}")
     return 0

@@ -19,7 +19,7 @@ from .output_paths import check_output_folder, output_path, print_line
 
 if TYPE_CHECKING:
     from ..recordings import Recording
-    from ..synthesis import Order
+    from ..synthesis import EpisodeSpec
 
 STOPPED_HINT = "; the same command continues, finished episodes remain"
 OVERVIEW_FILE = "overview.png"
@@ -28,7 +28,7 @@ GIF_RATE_HZ = 10.0
 
 def add(verbs: Any) -> None:
     """Add the verb and its options."""
-    from ..synthesis.episode_spec import CAMERAS, MOTIONS, Order
+    from ..synthesis.episode_spec import CAMERAS, MOTIONS, EpisodeSpec
 
     parser = verbs.add_parser(
         "simulate",
@@ -46,20 +46,22 @@ def add(verbs: Any) -> None:
     option(
         "--seed",
         type=int,
-        default=Order.seed,
+        default=EpisodeSpec.seed,
         metavar="N",
         help="seed of sensor errors and cloth placement (default: 0)",
     )
     option(
         "--triangles",
         type=int,
-        default=Order.triangles,
+        default=EpisodeSpec.triangles,
         metavar="N",
         help="approximate number of triangles (default: 800)",
     )
-    option("--camera", choices=CAMERAS, default=Order.camera, help="depth camera (default: azure_kinect)")
-    option("--rate", type=float, default=Order.rate, metavar="HZ", help="frames per second (default: 15)")
-    option("--speed", type=float, default=Order.speed, metavar="M_S", help="largest gripper speed [m/s] (default: 1)")
+    option("--camera", choices=CAMERAS, default=EpisodeSpec.camera, help="depth camera (default: azure_kinect)")
+    option("--rate", type=float, default=EpisodeSpec.rate, metavar="HZ", help="frames per second (default: 15)")
+    option(
+        "--speed", type=float, default=EpisodeSpec.speed, metavar="M_S", help="largest gripper speed [m/s] (default: 1)"
+    )
     option("--grippers-only", action="store_true", help="move free grippers instead of two Rizon 4 arms")
     option("--no-pictures", action="store_true", help="write episodes only")
     parser.set_defaults(run=_simulate, stopped=STOPPED_HINT)
@@ -72,26 +74,26 @@ def _simulate(options: argparse.Namespace) -> int:
     torch.set_num_threads(1)  # on meshes of a thousand triangles a second thread costs more than it gains
     out: Path = options.out
     check_output_folder(out)
-    orders = _episode_specs(options)
-    finished = {order.name: _is_finished(out / order.name, order) for order in orders}
+    specs = _episode_specs(options)
+    finished = {spec.name: _is_finished(out / spec.name, spec) for spec in specs}
     rows = []
-    for order in orders:
+    for spec in specs:
         started = time.process_time()
-        if not finished[order.name]:
-            _make(out, order)
-        rows.append((order, None if finished[order.name] else time.process_time() - started))
+        if not finished[spec.name]:
+            _make(out, spec)
+        rows.append((spec, None if finished[spec.name] else time.process_time() - started))
     if not options.no_pictures:
-        _draw(out, orders)
+        _draw(out, specs)
     _print(out, rows)
     return 0
 
 
-def _episode_specs(options: argparse.Namespace) -> list[Order]:
-    from ..synthesis import Order
+def _episode_specs(options: argparse.Namespace) -> list[EpisodeSpec]:
+    from ..synthesis import EpisodeSpec
 
     pairs = dict.fromkeys(product(options.garment, options.motion))
     return [
-        Order(
+        EpisodeSpec(
             garment,
             motion,
             fabric=options.fabric,
@@ -106,7 +108,7 @@ def _episode_specs(options: argparse.Namespace) -> list[Order]:
     ]
 
 
-def _is_finished(folder: Path, order: Order) -> bool:
+def _is_finished(folder: Path, spec: EpisodeSpec) -> bool:
     """Whether the episode exists; refuses an episode with another specification."""
     try:
         stored = json.loads((folder / "episode.json").read_text(encoding="utf-8")).get("order")
@@ -116,8 +118,8 @@ def _is_finished(folder: Path, order: Order) -> bool:
         stored = None
     except (OSError, ValueError, AttributeError):
         stored = None
-    if stored != order.items():
-        stored_spec, requested = stored if isinstance(stored, dict) else {}, order.items()
+    if stored != spec.as_dict():
+        stored_spec, requested = stored if isinstance(stored, dict) else {}, spec.as_dict()
         changed = [key for key, value in requested.items() if stored_spec.get(key) != value]
         raise InvalidInput(
             f"{folder}",
@@ -134,20 +136,20 @@ def _format_items(items: dict[str, Any], keys: list[str]) -> str:
     return ", ".join(f"{key} {items.get(key)}" for key in keys)
 
 
-def _make(out: Path, order: Order) -> None:
+def _make(out: Path, spec: EpisodeSpec) -> None:
     from .. import recordings, synthesis
 
-    with tempfile.TemporaryDirectory(prefix="torchcloth-") as images, _progress(order.name) as advance:
+    with tempfile.TemporaryDirectory(prefix="torchcloth-") as images, _progress(spec.name) as advance:
         try:
-            recording = synthesis.make(order, Path(images), advance)
+            recording = synthesis.make_episode(spec, Path(images), advance)
         except TorchclothError as error:
-            error.args = (f"{order.name}: {error}",)
+            error.args = (f"{spec.name}: {error}",)
             raise
         advance("writing", 0, 1)
-        if _is_finished(out / order.name, order):
+        if _is_finished(out / spec.name, spec):
             return  # another process has written it meanwhile
-        recordings.write(recording, out / order.name)
-        (out / f"{order.name}.gif").unlink(missing_ok=True)  # it may show an episode that was removed
+        recordings.write(recording, out / spec.name)
+        (out / f"{spec.name}.gif").unlink(missing_ok=True)  # it may show an episode that was removed
 
 
 @contextmanager
@@ -169,7 +171,7 @@ def _progress(name: str) -> Iterator[Callable[[str, int, int], None]]:
         yield advance
 
 
-def _draw(out: Path, orders: list[Order]) -> None:
+def _draw(out: Path, specs: list[EpisodeSpec]) -> None:
     """Write a GIF of each episode that has none, and one overview with a row of frames for each episode."""
     from PIL import Image
 
@@ -177,13 +179,13 @@ def _draw(out: Path, orders: list[Order]) -> None:
 
     with tempfile.TemporaryDirectory(prefix="torchcloth-") as folder:
         rows = []
-        for order in orders:
-            strip, gif = Path(folder) / f"{order.name}.png", out / f"{order.name}.gif"
-            film = viewing.film_of(recordings.read(out / order.name, with_truth=True), truth=True)
+        for spec in specs:
+            strip, gif = Path(folder) / f"{spec.name}.png", out / f"{spec.name}.gif"
+            film = viewing.film_from_recording(recordings.read(out / spec.name, with_truth=True), truth=True)
             if not gif.exists():
-                with _progress(order.name) as advance:
-                    viewing.animate(film, gif, rate=GIF_RATE_HZ, on_frame=lambda i, n, a=advance: a("drawing", i, n))
-            viewing.picture(film, strip, size=(320, 280))
+                with _progress(spec.name) as advance:
+                    viewing.write_gif(film, gif, rate=GIF_RATE_HZ, on_frame=lambda i, n, a=advance: a("drawing", i, n))
+            viewing.write_png(film, strip, size=(320, 280))
             rows.append(Image.open(strip).convert("RGB"))
         sheet = Image.new("RGB", (max(r.width for r in rows), sum(r.height for r in rows)), "white")
         for i, row in enumerate(rows):
@@ -192,7 +194,7 @@ def _draw(out: Path, orders: list[Order]) -> None:
             sheet.save(part, optimize=True)
 
 
-def _print(out: Path, rows: list[tuple[Order, float | None]]) -> None:
+def _print(out: Path, rows: list[tuple[EpisodeSpec, float | None]]) -> None:
     from rich.console import Console
     from rich.markup import escape
     from rich.table import Table
@@ -201,10 +203,10 @@ def _print(out: Path, rows: list[tuple[Order, float | None]]) -> None:
 
     headings = ("episode", "frames", "duration, s", "slowed down", "limited by", "clearance", "CPU time")
     table = Table(*headings, title=escape(str(out)))
-    for order, cpu_seconds in rows:
-        recording = recordings.read(out / order.name)
+    for spec, cpu_seconds in rows:
+        recording = recordings.read(out / spec.name)
         table.add_row(
-            order.name, *_summary_cells(recording), "existed" if cpu_seconds is None else f"{cpu_seconds:.0f} s"
+            spec.name, *_summary_cells(recording), "existed" if cpu_seconds is None else f"{cpu_seconds:.0f} s"
         )
     Console().print(table)
 

@@ -70,9 +70,9 @@ def _check_options(options: argparse.Namespace) -> tuple[int, int] | None:
     if options.fps is not None and not 0 < options.fps < float("inf"):
         raise InvalidInput("--fps", got=options.fps, expected="a number > 0")
     if options.fps is not None and suffix == ".gif":
-        from ..viewing.image_files import check_rate
+        from ..viewing.image_files import check_gif_rate
 
-        check_rate(options.fps)
+        check_gif_rate(options.fps)
     if options.size is None:
         return None
     match = re.fullmatch(r"(\d{2,4})x(\d{2,4})", options.size)
@@ -82,9 +82,9 @@ def _check_options(options: argparse.Namespace) -> tuple[int, int] | None:
             got=repr(options.size),
             expected="WIDTHxHEIGHT in pixels, of two to four digits, with a GIF or PNG",
         )
-    from ..viewing.frame_renderer import check_size
+    from ..viewing.frame_renderer import check_image_size
 
-    return check_size((int(match[1]), int(match[2])))
+    return check_image_size((int(match[1]), int(match[2])))
 
 
 def _film(options: argparse.Namespace) -> Film:
@@ -96,9 +96,9 @@ def _film(options: argparse.Namespace) -> Film:
     torch.set_num_threads(1)
     recording = recordings.read(options.episode, with_truth=options.truth)
     if options.fit is None:
-        film = viewing.film_of(recording, truth=options.truth)
+        film = viewing.film_from_recording(recording, truth=options.truth)
     else:
-        film = viewing.film_of_fit(recording, options.fit, truth=options.truth)
+        film = viewing.film_from_fit(recording, options.fit, truth=options.truth)
     return film if options.fps is None else film.at_most(options.fps)
 
 
@@ -111,15 +111,15 @@ def _write(film: Film, out: Path, size: tuple[int, int] | None, fps: float | Non
     if suffix == ".gif":
         with Progress(transient=True, disable=not sys.stdout.isatty()) as progress:
             task = progress.add_task("drawing", total=None)
-            viewing.animate(
+            viewing.write_gif(
                 film,
                 out,
                 size=size,
-                rate=fps or viewing.RATE,
+                rate=fps or viewing.DEFAULT_GIF_RATE_HZ,
                 on_frame=lambda done, total: progress.update(task, completed=done, total=total),
             )
     elif suffix == ".png":
-        viewing.picture(film, out, size=size)
+        viewing.write_png(film, out, size=size)
     elif suffix == ".rrd":
         viewing.write_rrd(film, out)
     else:

@@ -1,13 +1,13 @@
-"""Synthetic recordings: garments and sheets moved by a robot, simulated by this engine, seen by a depth camera.
+"""Synthetic recordings: a robot moves garments or sheets, this engine simulates them, a depth camera records them.
 
-What a fit recovers from them it recovers under the very model that made them (an inverse crime): they show whether a
-method works at all, never how well it does on cloth. Their provenance says so.
+A fit to these recordings uses the model that generated them (an inverse crime). They show whether a method works, not
+how well it works on real cloth. Their provenance says so.
 """
 
 from __future__ import annotations
 
-from .episode_spec import CAMERAS, MOTIONS, Order
+from .episode_spec import CAMERAS, MOTIONS, EpisodeSpec
 from .garments import GARMENTS
-from .generate import make
+from .generate import make_episode
 
-__all__ = ["CAMERAS", "GARMENTS", "MOTIONS", "Order", "make"]
+__all__ = ["CAMERAS", "GARMENTS", "MOTIONS", "EpisodeSpec", "make_episode"]

@@ -1,4 +1,4 @@
-"""What can be asked for."""
+"""Specification of a synthetic episode."""
 
 from __future__ import annotations
 
@@ -11,28 +11,29 @@ from .garments import GARMENTS
 
 MOTIONS = ("cover", "fling", "drag", "fold", "hang", "swing", "shake", "stretch")
 CAMERAS = ("azure_kinect", "d435")
-FEWEST, MOST = 50, 100_000  # triangles: fewer are no garment, more take days
-FASTEST = {"rate": 1000.0, "speed": 100.0, "acceleration": 1000.0}
+MIN_TRIANGLES, MAX_TRIANGLES = 50, 100_000  # fewer cannot form a garment, more take days
+UPPER_LIMITS = {"rate": 1000.0, "speed": 100.0, "acceleration": 1000.0}  # Hz, m/s, m/s^2
 
 
 @dataclass(frozen=True)
-class Order:
-    """One episode.
+class EpisodeSpec:
+    """Specification of one episode.
 
     Attributes:
-        garment: among ``GARMENTS``.
-        motion: among ``MOTIONS``.
-        fabric: a published fabric; None: the garment's own.
-        seed: of the sensor's errors and of the place where the cloth lies (a few mm).
-        triangles: of the cloth, about.
-        camera: among ``CAMERAS``.
-        arms: two Rizon 4 move the grippers, as their joints allow, and stand in the camera's way; else grippers fly.
+        garment: one of ``GARMENTS``.
+        motion: one of ``MOTIONS``.
+        fabric: a published fabric; None: that of the garment.
+        seed: of the sensor's errors and of the cloth's placement (a few mm).
+        triangles: approximate number of triangles of the cloth.
+        camera: one of ``CAMERAS``.
+        arms: whether two Rizon 4 arms move the grippers, within their joint limits, and occlude the camera's view;
+            otherwise grippers are free.
         rate: frames per second.
-        speed: m/s, of the grippers, at most.
-        acceleration: m/s^2, likewise; with arms, the joints' limits lower both.
+        speed: largest speed of the grippers [m/s].
+        acceleration: largest acceleration of the grippers [m/s^2]; with arms, joint limits lower both.
 
     Raises:
-        InvalidInput: a name that is not known, or a number out of range.
+        InvalidInput: a name is unknown, or a number is out of range.
     """
 
     garment: str
@@ -51,25 +52,25 @@ class Order:
             if getattr(self, name) not in known:
                 raise InvalidInput(name, got=repr(getattr(self, name)), expected=f"one of {', '.join(known)}")
         find_fabric(self.cloth_fabric)
-        if not FEWEST <= self.triangles <= MOST:
-            raise InvalidInput("triangles", got=self.triangles, expected=f"{FEWEST} to {MOST}")
+        if not MIN_TRIANGLES <= self.triangles <= MAX_TRIANGLES:
+            raise InvalidInput("triangles", got=self.triangles, expected=f"{MIN_TRIANGLES} to {MAX_TRIANGLES}")
         if self.seed < 0:
             raise InvalidInput("seed", got=self.seed, expected="0 or more")
-        for name, most in FASTEST.items():
-            if not 0 < getattr(self, name) <= most:
-                raise InvalidInput(name, got=getattr(self, name), expected=f"a value > 0, at most {most:g}")
+        for name, limit in UPPER_LIMITS.items():
+            if not 0 < getattr(self, name) <= limit:
+                raise InvalidInput(name, got=getattr(self, name), expected=f"a value > 0, at most {limit:g}")
 
     @property
     def cloth_fabric(self) -> str:
-        """The fabric that is used."""
+        """Name of the fabric that is used."""
         return GARMENTS[self.garment].fabric if self.fabric is None else self.fabric
 
     @property
     def name(self) -> str:
-        """Of the episode's folder."""
+        """Name of the episode's folder."""
         parts = [self.garment, self.motion, *([] if self.fabric is None else [self.fabric])]
         return "_".join([*parts, *([f"seed{self.seed}"] if self.seed else [])])
 
-    def facts(self) -> dict[str, Any]:
-        """As an episode stores it."""
+    def as_dict(self) -> dict[str, Any]:
+        """Return the specification as the episode stores it."""
         return asdict(self)

@@ -1,4 +1,4 @@
-"""What is moved: garments of a child's size and a sheet, what they are made of, and where they are gripped."""
+"""Garments of a child's size and a sheet: meshes, materials and grip places."""
 
 from __future__ import annotations
 
@@ -12,29 +12,36 @@ from ..materials import AEP, AbstractMaterial, OrthotropicAEP
 from ..materials.presets import NOMINAL_THICKNESS_M, find_fabric
 from ..meshes import Mesh
 
-SHEET = 0.5  # m, its sides
-DENSITY = 0.2  # kg/m^2, where the fabric's source gives none
-BENDING = 1e-5  # N m, likewise: a light cotton's
-DAMPING = 0.03  # s, of bending
-OFF = 1.5  # times the true membrane stiffness stands on the data sheet: a fit has something to find
-PRESSURE, SLIDING = 60.0, 20.0  # N/m, k h and gamma h between layers: published ones ask for far smaller substeps
+SHEET_SIDE_M = 0.5
+DEFAULT_AREAL_DENSITY_KG_PER_M2 = 0.2  # if the fabric's source gives none
+DEFAULT_BENDING_STIFFNESS_NM = 1e-5  # likewise; that of a light cotton
+BENDING_DAMPING_TIME_S = 0.03
+NOMINAL_STIFFNESS_FACTOR = 1.5  # nominal over true membrane stiffness, so that a fit has something to find
+CONTACT_STIFFNESS_N_PER_M, SHEAR_STIFFNESS_N_PER_M = 60.0, 20.0  # k h and gamma h; published ones need tiny substeps
 
 
 class Garment(NamedTuple):
-    """A garment whose body lies along y, front up; held at two places, the first by the arm on the side of -x."""
+    """A garment. Its body lies along y, front up, and it is gripped at two places.
+
+    Attributes:
+        mesh: function that builds the mesh, with argument ``triangles``.
+        scale: of an adult's measures.
+        fabric: name of the preset.
+        grips: places on the mesh; the first one is on the side of -x.
+    """
 
     mesh: Callable[..., Mesh]
-    scale: float  # of an adult's measures
+    scale: float
     fabric: str
     grips: tuple[str, str]
 
 
 def _sheet(triangles: int) -> Mesh:
-    """A square with its upper corners as places."""
-    flat = meshes.rectangle(SHEET, SHEET, triangles=triangles)
-    shifted = flat.vertices - [SHEET / 2, SHEET, 0.0]
-    far = np.abs(shifted[:, 0]) > SHEET / 2 - 1e-9
-    top = far & (shifted[:, 1] > -1e-9)
+    """Return a square mesh with its upper corners as places."""
+    flat = meshes.rectangle(SHEET_SIDE_M, SHEET_SIDE_M, triangles=triangles)
+    shifted = flat.vertices - [SHEET_SIDE_M / 2, SHEET_SIDE_M, 0.0]
+    at_side = np.abs(shifted[:, 0]) > SHEET_SIDE_M / 2 - 1e-9
+    top = at_side & (shifted[:, 1] > -1e-9)
     places = {"left corner": np.flatnonzero(top & (shifted[:, 0] < 0))}
     places["right corner"] = np.flatnonzero(top & (shifted[:, 0] > 0))
     return Mesh.build(shifted, flat.faces, flat.pattern, places)
@@ -48,45 +55,53 @@ GARMENTS = {
 }
 
 
-def sewn(garment: Garment, triangles: int) -> Mesh:
-    """The garment's mesh at its scale, in its own frame."""
-    made = garment.mesh(triangles=triangles)
-    return Mesh.build(garment.scale * made.vertices, made.faces, garment.scale * np.asarray(made.pattern), made.places)
+def build_garment_mesh(garment: Garment, triangles: int) -> Mesh:
+    """Build the garment's mesh at its scale, in the garment's frame."""
+    mesh = garment.mesh(triangles=triangles)
+    return Mesh.build(garment.scale * mesh.vertices, mesh.faces, garment.scale * np.asarray(mesh.pattern), mesh.places)
 
 
-def material(fabric: str) -> AbstractMaterial:
-    """The law of a published fabric, orthotropic where its membrane is, with a softer contact between layers.
+def build_material(fabric: str) -> AbstractMaterial:
+    """Build the material of a published fabric, with a softer contact between layers.
+
+    The material is orthotropic if the membrane stiffness differs between warp and weft.
 
     Raises:
-        InvalidInput: an unknown fabric, or one whose source leaves out a stiffness.
+        InvalidInput: the fabric is unknown, or its source gives no stiffness.
     """
     row = find_fabric(fabric)
     if row.membrane_warp is not None and row.membrane_warp != row.membrane_weft:
-        return OrthotropicAEP(**_softened(row.orthotropic()))
-    return AEP(**_softened(row.isotropic()))
+        return OrthotropicAEP(**_with_soft_contact(row.orthotropic()))
+    return AEP(**_with_soft_contact(row.isotropic()))
 
 
-def numbers(fabric: str) -> dict[str, float]:
-    """Areal density [kg/m^2], bending stiffness [N m] and thickness [m], ours where a fabric's source gives none."""
+def cloth_properties(fabric: str) -> dict[str, float]:
+    """Return areal density [kg/m^2], bending stiffness [N m] and thickness [m]; defaults where the source has none."""
     row = find_fabric(fabric)
     return {
-        "areal_density": row.areal_density or DENSITY,
-        "bending_stiffness": row.bending_warp or BENDING,
+        "areal_density": row.areal_density or DEFAULT_AREAL_DENSITY_KG_PER_M2,
+        "bending_stiffness": row.bending_warp or DEFAULT_BENDING_STIFFNESS_NM,
         "thickness": row.thickness or NOMINAL_THICKNESS_M,
     }
 
 
-def data_sheet(fabric: str) -> dict[str, float]:
-    """Nominal values of an episode's cloth: the membrane ``OFF`` times too stiff (along the warp), the rest true."""
+def nominal_properties(fabric: str) -> dict[str, float]:
+    """Return nominal values of an episode's cloth: a membrane stiffness that is too high, and true values else.
+
+    The nominal stiffness is ``NOMINAL_STIFFNESS_FACTOR`` times the true one along the warp.
+    """
     row = find_fabric(fabric)
-    sheet = {"bending_stiffness": numbers(fabric)["bending_stiffness"], "bending_damping_time": DAMPING}
+    sheet = {
+        "bending_stiffness": cloth_properties(fabric)["bending_stiffness"],
+        "bending_damping_time": BENDING_DAMPING_TIME_S,
+    }
     if row.membrane_warp is not None:
-        sheet["membrane_stiffness"] = OFF * row.membrane_warp
+        sheet["membrane_stiffness"] = NOMINAL_STIFFNESS_FACTOR * row.membrane_warp
     if row.poisson is not None:
         sheet["poisson_ratio"] = row.poisson
     return sheet
 
 
-def _softened(values: dict[str, Any]) -> dict[str, Any]:
+def _with_soft_contact(values: dict[str, Any]) -> dict[str, Any]:
     h = values["thickness"]
-    return values | {"contact_stiffness": PRESSURE / h, "shear_stiffness": SLIDING / h}
+    return values | {"contact_stiffness": CONTACT_STIFFNESS_N_PER_M / h, "shear_stiffness": SHEAR_STIFFNESS_N_PER_M / h}

@@ -1,20 +1,20 @@
-"""The depth camera that looks on, across the table at the arms."""
+"""Depth camera that looks across the table at the arms."""
 
 from __future__ import annotations
 
 import numpy as np
 
 from ..observe import DepthCamera, DepthNoise, StereoNoise, View, look_at
-from .episode_spec import Order
+from .episode_spec import EpisodeSpec
 
-EYE, TARGET = (1.50, 0.45, 0.85), (0.52, 0.0, 0.20)  # m
-POINTS = 600  # of the cloth, per frame at most
-DEPTH_SCALE = 0.001  # m
+CAMERA_POSITION_M, CAMERA_TARGET_M = (1.50, 0.45, 0.85), (0.52, 0.0, 0.20)
+POINTS_PER_FRAME = 600  # of the cloth, at most
+DEPTH_SCALE_M = 0.001
 
 
-def view(order: Order, rng: np.random.Generator) -> View:
-    """The order's camera in its place, with the errors of one device."""
-    place = look_at(np.array(EYE), np.array(TARGET))
-    if order.camera == "d435":
-        return View(DepthCamera.realsense_d435(place), StereoNoise(), points=POINTS).with_bias(rng)
-    return View(DepthCamera.azure_kinect_nfov(place), DepthNoise(), points=POINTS).with_bias(rng)
+def build_view(spec: EpisodeSpec, rng: np.random.Generator) -> View:
+    """Build the specified camera at its place, with the errors of one device."""
+    pose = look_at(np.array(CAMERA_POSITION_M), np.array(CAMERA_TARGET_M))
+    if spec.camera == "d435":
+        return View(DepthCamera.realsense_d435(pose), StereoNoise(), max_points=POINTS_PER_FRAME).with_bias(rng)
+    return View(DepthCamera.azure_kinect_nfov(pose), DepthNoise(), max_points=POINTS_PER_FRAME).with_bias(rng)

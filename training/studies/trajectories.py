@@ -36,7 +36,7 @@ from torchcloth.types import Trajectory
 
 from ..resumable import Kept
 from .manipulations.console_tables import heading_table, mm, show, write
-from .manipulations.scenes import FRICTION, LAYERS, Discretisation, Fabric, Manipulation
+from .manipulations.scenes import TABLE_FRICTION, INITIAL_LAYER_DISTANCE_M, Discretisation, Fabric, Manipulation
 from .manipulations.scenes import Scene as Staged
 from .trajectory_figures import curves
 
@@ -177,7 +177,7 @@ def set_up(garment: str, motion: str, fine: Discretisation, waypoints: int) -> S
         provenance="synthetic: torchcloth, same engine",
         grasps={name: GraspInfo(vertices=held) for name, held in staged.held.items()},
         grippers={name: to_gripper_motion(path) for name, path in staged.action.motion.items()},
-        colliders={"table": Collider(np.array([0.0, 0.0, LAYERS / 2]), np.array([0.0, 0.0, 1.0]), FRICTION)},
+        colliders={"table": Collider(np.array([0.0, 0.0, INITIAL_LAYER_DISTANCE_M / 2]), np.array([0.0, 0.0, 1.0]), TABLE_FRICTION)},
     )
     courses = extract_motion_parameters(cloth, recording, waypoints, WAIT, DEFAULT_JOINT_ACCELERATION, GripperLimits())
     return Scene(cloth, recording, courses, ForwardModel(exact_model(cloth), recording, courses, None))
@@ -186,7 +186,7 @@ def set_up(garment: str, motion: str, fine: Discretisation, waypoints: int) -> S
 def hidden_goal(scene: Scene, rng: np.random.Generator) -> Goal:
     """Where another motion within the limits brings the garment, as noisy points of its surface."""
     blank = PlanningTask([scene.run], scene.courses, Goal(torch.zeros(1, 3)), None, None)
-    wanted = torch.as_tensor(rng.standard_normal((len(scene.courses), *blank.courses[0].zero_waypoints.shape)))
+    wanted = torch.as_tensor(rng.standard_normal((len(scene.courses), *blank.motions[0].zero_waypoints.shape)))
     wanted = (0.7 * wanted.mean(0) + 0.3 * wanted) * torch.tensor([AWAY] * 3 + [TURN] * 3)  # hands go much alike
     at = solve_constrained_step(blank.start, -wanted.flatten(), torch.eye(len(blank.start)).to(wanted), blank.bounds)
     with torch.no_grad():

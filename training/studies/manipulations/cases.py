@@ -14,7 +14,7 @@ from torchcloth.episodes.observed import Episode, build_episode
 from torchcloth.episodes.replay import Replay
 from torchcloth.errors import SimulationDiverged, UnstableStep
 from torchcloth.identification import Identification, identify
-from torchcloth.identification.residuals.rigid_carry import rigid_carry
+from torchcloth.identification.residuals.rigid_carry import carry_rigidly
 from torchcloth.losses import chamfer_to_surface, chamfer_to_vertices
 
 from .episodes import Seen, record
@@ -111,7 +111,7 @@ def stated(fit: Identification) -> dict[str, Any]:
     keys = ("iterations", "simulations", "seconds", "points", "independent_observations", "converged")
     return {
         "found": found,
-        "moves_mm": {name: i.tenth_mm for name, i in fit.influences.items()},
+        "moves_mm": {name: i.displacement_per_10_percent_mm for name, i in fit.influences.items()},
         "fit": {key: fit.fit[key] for key in keys},
         "warnings": fit.warnings,
     }
@@ -122,7 +122,7 @@ def _distances(setup: Setup, model: Scene, data: Seen, fit: Identification) -> d
     start = Fabric.true(model.what.garment).start()
     fitted = Fabric(*(fit.parameters[name].value for name in start.named()))
     clouds = build_episode(model.cloth(start), data.recording)
-    frames = {"null": rigid_carry(clouds)}
+    frames = {"null": carry_rigidly(clouds)}
     for state, fabric in (("start", start), ("fit", fitted)):
         with torch.no_grad():
             frames[state] = Replay(model.cloth(fabric))(clouds).x

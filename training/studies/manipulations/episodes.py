@@ -11,19 +11,19 @@ from torch import Tensor
 
 from torchcloth import recordings as rec
 from torchcloth.errors import SimulationDiverged
-from torchcloth.losses import closest
-from torchcloth.observe import DepthCamera, DepthNoise, View, capture, look_at, render_depth, solid_mesh
+from torchcloth.losses import find_closest_points
+from torchcloth.observe import DepthCamera, DepthNoise, View, capture, look_at, render_depth, build_solid_mesh
 from torchcloth.robots import to_gripper_motion  # pyright: ignore[reportMissingImports] - mapped from robots/
-from torchcloth.synthesis.garments import DENSITY
-from torchcloth.synthesis.sensors import EYE, TARGET
+from torchcloth.synthesis.garments import DEFAULT_AREAL_DENSITY_KG_PER_M2
+from torchcloth.synthesis.sensors import CAMERA_POSITION_M, CAMERA_TARGET_M
 from torchcloth.types import Trajectory
 
-from .scenes import LAYERS, Fabric, Manipulation, Scene
+from .scenes import INITIAL_LAYER_DISTANCE_M, Fabric, Manipulation, Scene
 
-SETTLING = 0.6  # s, in which hanging cloth comes to rest before the first frame
-FEWEST = 10  # points; a frame with fewer is left out
-POLE = (0.045, 0.02, 1.2)  # m, a box that stands in the camera's way
-STANDS = 0.55  # of the way from the target to the camera
+SETTLING_TIME_S = 0.6  # s, in which hanging cloth comes to rest before the first frame
+MIN_CLOUD_POINTS = 10  # points; a frame with fewer is left out
+POLE_SIZE_M = (0.045, 0.02, 1.2)  # m, a box that stands in the camera's way
+POLE_POSITION_FRACTION = 0.55  # of the way from the target to the camera
 
 
 class Seen(NamedTuple):
@@ -53,12 +53,12 @@ def record(truth: Scene, model: Scene, rate: float, points: int) -> Seen:
     t = np.arange(int(end * rate + 1e-6) + 1) / rate
     x = _simulate(truth, motion, t)
     clouds, sigma, hidden = _look(what, x, truth.mesh.faces, points)
-    kept = [i for i, cloud in enumerate(clouds) if i == 0 or len(cloud) >= FEWEST]
-    place = closest(torch.as_tensor(model.rest), torch.as_tensor(truth.rest), torch.as_tensor(truth.mesh.faces))
-    own = place.on(torch.as_tensor(x[kept]))
+    kept = [i for i, cloud in enumerate(clouds) if i == 0 or len(cloud) >= MIN_CLOUD_POINTS]
+    place = find_closest_points(torch.as_tensor(model.rest), torch.as_tensor(truth.rest), torch.as_tensor(truth.mesh.faces))
+    own = place.interpolate(torch.as_tensor(x[kept]))
     recording = rec.Recording(
         cloth=rec.ClothInfo(
-            areal_density=DENSITY,
+            areal_density=DEFAULT_AREAL_DENSITY_KG_PER_M2,
             vertices=model.rest,
             faces=model.mesh.faces,
             uv=model.mesh.pattern,
@@ -66,7 +66,7 @@ def record(truth: Scene, model: Scene, rate: float, points: int) -> Seen:
         ),
         provenance=f"synthetic: the fitted engine on {truth.fine.triangles} triangles (same law, other discretisation)",
         grasps={name: rec.GraspInfo(vertices=held) for name, held in model.held.items()},
-        colliders={"table": rec.Collider(np.array([0.0, 0.0, LAYERS / 2]), np.array([0.0, 0.0, 1.0]))},
+        colliders={"table": rec.Collider(np.array([0.0, 0.0, INITIAL_LAYER_DISTANCE_M / 2]), np.array([0.0, 0.0, 1.0]))},
         points=rec.PointClouds(
             t[kept], np.concatenate([clouds[i] for i in kept]), np.array([len(clouds[i]) for i in kept])
         ),
@@ -82,7 +82,7 @@ def _simulate(scene: Scene, motion: dict[str, Trajectory], t: np.ndarray) -> np.
     cloth = scene.cloth(Fabric.true(scene.what.garment))
     dt, state = scene.fine.step * cloth.stable_step(), cloth.rest_state()
     if scene.hangs:
-        state = cloth.settle(state, motion, duration=SETTLING)
+        state = cloth.settle(state, motion, duration=SETTLING_TIME_S)
     x = cloth(state, motion, t.tolist(), dt=dt, checkpoint=False).x.numpy()
     if not float(np.ptp(x, axis=1).max()) < 2 * scene.mesh.extent:
         raise SimulationDiverged(f"{scene.what.name}: the cloth is torn apart", remedy="report this")
@@ -92,8 +92,8 @@ def _simulate(scene: Scene, motion: dict[str, Trajectory], t: np.ndarray) -> np.
 def _look(what: Manipulation, x: np.ndarray, faces: np.ndarray, points: int) -> tuple[list[np.ndarray], float, float]:
     """Clouds [N, 3] m of all frames, the mean deviation of a point's depth [m], and the share that the pole hides."""
     rng = np.random.default_rng([sum(map(ord, what.garment)), what.number])
-    camera = DepthCamera.azure_kinect_nfov(look_at(np.array(EYE), np.array(TARGET)))
-    view = View(camera, DepthNoise(), points=points).with_bias(rng)
+    camera = DepthCamera.azure_kinect_nfov(look_at(np.array(CAMERA_POSITION_M), np.array(CAMERA_TARGET_M)))
+    view = View(camera, DepthNoise(), max_points=points).with_bias(rng)
     pole, clouds, sigma, free = _pole(rng), [], [], []
     for i, frame in enumerate(x):
         cloud = capture(view, frame, faces, [pole], rng=rng).points
@@ -108,11 +108,11 @@ def _look(what: Manipulation, x: np.ndarray, faces: np.ndarray, points: int) -> 
 
 def _pole(rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
     """Vertices and triangles of an upright box between camera and cloth, somewhat to a side."""
-    eye, target = np.array(EYE), np.array(TARGET)
+    eye, target = np.array(CAMERA_POSITION_M), np.array(CAMERA_TARGET_M)
     toward = np.array([eye[0] - target[0], eye[1] - target[1], 0.0])
     toward /= np.linalg.norm(toward)
     across = np.array([-toward[1], toward[0], 0.0])
     pose = np.eye(4)
     pose[:3, :3] = np.stack([across, toward, [0.0, 0.0, 1.0]], axis=1)
-    pose[:3, 3] = target + STANDS * (eye - target) + rng.uniform(-0.05, 0.05) * across
-    return solid_mesh("box", POLE, pose)
+    pose[:3, 3] = target + POLE_POSITION_FRACTION * (eye - target) + rng.uniform(-0.05, 0.05) * across
+    return build_solid_mesh("box", POLE_SIZE_M, pose)

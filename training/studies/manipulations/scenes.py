@@ -18,7 +18,7 @@ from torchcloth.materials import AEP
 from torchcloth.meshes import Mesh
 from torchcloth.robots import primitives  # pyright: ignore[reportMissingImports] - mapped from robots/
 from torchcloth.robots.primitives import Action, GripperLimits  # pyright: ignore[reportMissingImports]
-from torchcloth.synthesis.garments import BENDING, DAMPING, DENSITY, GARMENTS, material, numbers, sewn
+from torchcloth.synthesis.garments import DEFAULT_BENDING_STIFFNESS_NM, BENDING_DAMPING_TIME_S, DEFAULT_AREAL_DENSITY_KG_PER_M2, GARMENTS, build_material, cloth_properties, build_garment_mesh
 
 WORN = ("dress", "trousers", "shirt")
 ACTIONS = ("cover", "fling", "drag")
@@ -29,12 +29,12 @@ GRIPS = {
     "lower": (0.0, 0.08),
 }  # share towards the middle, of length
 POSTURES = {"straight": 0.0, "turned left": 0.35, "turned right": -0.35}  # rad, the cloth's body from the motion
-LAYERS = 1e-3  # m between front and back at the start
-FRICTION = 0.4
-LOWEST = 0.12  # m above the table, of hanging cloth
-DRAG = 1.2  # of a flat plate, broadside
-PAD = 0.05  # m, radius of what a gripper holds: on a coarse mesh, enough for some vertices
-REST = 0.12  # s, after the grippers open
+INITIAL_LAYER_DISTANCE_M = 1e-3  # m between front and back at the start
+TABLE_FRICTION = 0.4
+MIN_HANGING_HEIGHT_M = 0.12  # m above the table, of hanging cloth
+PLATE_DRAG_COEFFICIENT = 1.2  # of a flat plate, broadside
+COARSE_GRIP_RADIUS_M = 0.05  # m, radius of what a gripper holds: on a coarse mesh, enough for some vertices
+REST_TIME_S = 0.12  # s, after the grippers open
 
 
 @dataclass(frozen=True)
@@ -77,13 +77,13 @@ class Fabric(NamedTuple):
     poisson_ratio: float
     contact_stiffness: float
     shear_stiffness: float
-    bending: float = BENDING
-    air: float = DRAG
+    bending: float = DEFAULT_BENDING_STIFFNESS_NM
+    air: float = PLATE_DRAG_COEFFICIENT
 
     @classmethod
     def true(cls, garment: str) -> Fabric:
         """The paper's E and nu as the preset reads them, with the softer contact of ``torchcloth simulate``."""
-        law = material(GARMENTS[garment].fabric)
+        law = build_material(GARMENTS[garment].fabric)
         names = cls._fields[:4]
         return cls(*(float(getattr(law, name).value.detach()) for name in names))
 
@@ -123,29 +123,29 @@ class Scene:
     def __init__(self, what: Manipulation, fine: Discretisation) -> None:
         self.what, self.fine, self.hangs = what, fine, what.action == "fling"
         self.garment = GARMENTS[what.garment]
-        made = sewn(self.garment, fine.triangles)
+        made = build_garment_mesh(self.garment, fine.triangles)
         self.rest, self.length = made.vertices, float(np.ptp(made.vertices[:, 1]))
         self.mesh = Mesh.build(self._placed(self.rest), made.faces, made.pattern, made.places)
         places = self._grips(made)
         apart = {name: np.linalg.norm(self.rest - place, axis=1) for name, place in places.items()}
-        self.held = {name: np.flatnonzero(distance <= PAD) for name, distance in apart.items()}
+        self.held = {name: np.flatnonzero(distance <= COARSE_GRIP_RADIUS_M) for name, distance in apart.items()}
         if not all(len(held) for held in self.held.values()):
             raise InvalidInput("--triangles", got=fine.triangles, expected="a vertex in every grip, so more triangles")
         self.action = self._action({name: tuple(self._placed(place[None])[0]) for name, place in places.items()})
 
     def cloth(self, fabric: Fabric) -> tc.Cloth:
         """The garment with these values."""
-        h = numbers(self.garment.fabric)["thickness"]
+        h = cloth_properties(self.garment.fabric)["thickness"]
         law = AEP(*fabric[:2], contact_stiffness=fabric[2], shear_stiffness=fabric[3], thickness=h)
         effects = {
             "gravity": Gravity(),
             "air": AirDrag(fabric.air),
-            "bending": Bending(fabric.bending, damping_time=DAMPING),
+            "bending": Bending(fabric.bending, damping_time=BENDING_DAMPING_TIME_S),
         }
         boundaries = {name: Grasp(held.tolist()) for name, held in self.held.items()}
-        table = Plane(friction=FRICTION, offset=LAYERS / 2)
+        table = Plane(friction=TABLE_FRICTION, offset=INITIAL_LAYER_DISTANCE_M / 2)
         return tc.Cloth(
-            self.mesh, law, DENSITY, effects, {**boundaries, "table": table}, Contact.with_gap(self.fine.gap)
+            self.mesh, law, DEFAULT_AREAL_DENSITY_KG_PER_M2, effects, {**boundaries, "table": table}, Contact.with_gap(self.fine.gap)
         )
 
     def _grips(self, made: Mesh) -> dict[str, np.ndarray]:
@@ -162,11 +162,11 @@ class Scene:
         Away from the arms is +x; the gripped end is up, or towards the arms. The body is turned about the vertical.
         """
         x, y, z = points.T
-        z = z * (LAYERS / (meshes.garments.GAP * self.garment.scale))
+        z = z * (INITIAL_LAYER_DISTANCE_M / (meshes.garments.LAYER_GAP_M * self.garment.scale))
         if self.hangs:
-            forward, side, up = z, x, LOWEST + self.length / 2 + y
+            forward, side, up = z, x, MIN_HANGING_HEIGHT_M + self.length / 2 + y
         else:
-            forward, side, up = self.length / 2 - y, x, z + 1.5 * LAYERS
+            forward, side, up = self.length / 2 - y, x, z + 1.5 * INITIAL_LAYER_DISTANCE_M
         turn = POSTURES[self.what.posture]
         near = {"drag": 0.46, "cover": 0.36, "fling": 0.50}[self.what.action]
         return np.stack(
@@ -183,11 +183,11 @@ class Scene:
         speed = SPEEDS[self.what.speed] / self.what.slower
         limits = GripperLimits(speed, 8.0 * speed**2)
         if self.what.action == "fling":
-            return primitives.fling(grips, 0.12, heading=0.0, pull=0.15, landing=0.05, rest=REST, limits=limits)
+            return primitives.fling(grips, 0.12, heading=0.0, pull=0.15, landing=0.05, rest=REST_TIME_S, limits=limits)
         if self.what.action == "drag":
-            return primitives.drag(grips, 0.15, heading=math.pi, landing=0.02, rest=REST, limits=limits)
+            return primitives.drag(grips, 0.15, heading=math.pi, landing=0.02, rest=REST_TIME_S, limits=limits)
         reach = 0.75 * self.length
-        return primitives.cover(grips, reach, heading=0.0, landing=2 * self.fine.gap, rest=REST, limits=limits)
+        return primitives.cover(grips, reach, heading=0.0, landing=2 * self.fine.gap, rest=REST_TIME_S, limits=limits)
 
 
 def slowed(what: Manipulation, length: float, fine: Discretisation) -> Manipulation:
@@ -199,4 +199,4 @@ def slowed(what: Manipulation, length: float, fine: Discretisation) -> Manipulat
     lasts = min(float(path.t[-1]) for path in Scene(what, fine).action.motion.values())
     if length < lasts:
         raise InvalidInput("--length", got=f"{length:g} s", expected=f"{lasts:.2f} s or more")
-    return replace(what, slower=what.slower * (length - REST) / (lasts - REST))
+    return replace(what, slower=what.slower * (length - REST_TIME_S) / (lasts - REST_TIME_S))
