@@ -2,7 +2,6 @@
 
 import ast
 import os
-import re
 import sys
 from pathlib import Path
 
@@ -15,9 +14,8 @@ pytest.importorskip("ipykernel")
 FOLDER = Path(__file__).resolve().parents[1] / "notebooks"
 NOTEBOOKS = sorted(FOLDER.glob("*.ipynb"))
 SECONDS = 1800  # for one cell; the notebooks take minutes, on a busy machine many
-LARGEST = 1.5e6  # bytes, with outputs
+MAX_BYTES = 100_000  # of a notebook without outputs
 PLACES = ("/work", "/tmp", "/root", "/home", "/Users", "site-packages", "C:\\\\")  # as they stand in JSON
-IMAGES = re.compile(r'"image/\w+": "[^"]*"')  # base64 holds slashes and letters in any order
 
 each = pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
 
@@ -45,23 +43,25 @@ def test_it_runs(path, tmp_path, monkeypatch):
     manager = ThisInterpreter(kernel_name="python3")
     client = nbclient.NotebookClient(notebook, km=manager, timeout=SECONDS, resources={"metadata": {"path": tmp_path}})
     client.execute(env=dict(os.environ))  # raises CellExecutionError with the traceback
+    outputs = [output for cell in notebook.cells for output in cell.get("outputs", [])]
+    assert any("image/png" in output.get("data", {}) for output in outputs)
+    assert not [output for output in outputs if output.get("name") == "stderr"]
     assert notebook.cells[-1].outputs[0].text.strip() == sys.executable
     assert not list(tmp_path.iterdir()), "a notebook leaves no files behind"
 
 
 @each
-def test_it_is_stored_with_its_outputs_and_without_errors(path):
+def test_it_is_stored_without_outputs(path):
+    """`nbstripout FILE` removes them; the documentation site executes the notebooks."""
     cells = [cell for cell in nbformat.read(path, as_version=4).cells if cell.cell_type == "code"]
-    assert [cell.execution_count for cell in cells] == list(range(1, len(cells) + 1)), "run all cells in order"
-    outputs = [output for cell in cells for output in cell.outputs]
-    assert any("image/png" in output.get("data", {}) for output in outputs)
-    assert not [output for output in outputs if output.output_type == "error" or output.get("name") == "stderr"]
-    assert path.stat().st_size < LARGEST
+    assert [cell.outputs for cell in cells] == [[] for _ in cells]
+    assert {cell.execution_count for cell in cells} == {None}
+    assert path.stat().st_size < MAX_BYTES
 
 
 @each
 def test_it_holds_no_path_of_the_machine(path):
-    text = IMAGES.sub("", path.read_text(encoding="utf-8"))
+    text = path.read_text(encoding="utf-8")
     assert not [place for place in PLACES if place in text]
 
 
