@@ -1,4 +1,4 @@
-"""What was found last: for a tensor, or for what it depends on."""
+"""Caches: one value per tensor and its version, or the least recently used values by key."""
 
 from __future__ import annotations
 
@@ -19,68 +19,74 @@ S = TypeVar("S")
 
 
 class VersionedTensorCache(Generic[T]):
-    """One value per tensor, for as long as the tensor is there and torch does not write to it."""
+    """One value per tensor, valid while the tensor lives and torch does not write to it."""
 
     def __init__(self) -> None:
-        self._last: WeakTensorKeyDictionary = WeakTensorKeyDictionary()
+        self._entries: WeakTensorKeyDictionary = WeakTensorKeyDictionary()
 
     def get_or_compute(self, tensor: Tensor, compute: Callable[[], T], dependencies: object = None) -> T:
-        """``find()``, or what it said last, where neither the tensor nor ``beside`` is another one since."""
-        if tensor.is_inference():  # nothing tells whether somebody wrote to it
+        """Return the cached value, or compute it anew if the tensor or ``dependencies`` have changed.
+
+        Tensors of inference mode have no version, so their values are always computed.
+        """
+        if tensor.is_inference():
             return compute()
-        now = tensor._version, dependencies
-        kept = self._last.get(tensor)
-        if kept is None or kept[0] != now:
-            kept = self._last[tensor] = now, compute()
-        return kept[1]
+        version = tensor._version, dependencies
+        entry = self._entries.get(tensor)
+        if entry is None or entry[0] != version:
+            entry = self._entries[tensor] = version, compute()
+        return entry[1]
 
 
 class LRUCache(Generic[T]):
-    """The values that were asked for last, by what they depend on; nobody may write to one.
+    """The least recently used values, by key. Callers must not write to a cached value.
 
-    Nobody waits for another thread either, which may not be there any more after a fork.
+    A thread that finds the lock taken computes the value itself: after a fork the thread that holds it may not exist.
 
     Args:
-        budget: bytes that they may take together.
-        size: bytes of a value.
+        max_bytes: bytes that all keys and values may take together.
+        size_in_bytes: returns the bytes of a value.
     """
 
     def __init__(self, max_bytes: int, size_in_bytes: Callable[[T], int]) -> None:
-        self.max_bytes, self._size = max_bytes, size_in_bytes
-        self._kept: OrderedDict[Hashable, tuple[T, int]] = OrderedDict()
+        self.max_bytes, self._size_in_bytes = max_bytes, size_in_bytes
+        self._entries: OrderedDict[Hashable, tuple[T, int]] = OrderedDict()
         self._bytes, self._lock = 0, Lock()
 
     def get_or_compute(self, key: Hashable, compute: Callable[[], T]) -> T:
-        """``find()``, or what it said for an equal key."""
-        known = self._alone(lambda: self._known(key))
-        if known is not None:
-            return known[0]
+        """Return the value that was computed for an equal key, or compute and store it."""
+        entry = self._if_unlocked(lambda: self._look_up(key))
+        if entry is not None:
+            return entry[0]
         value = compute()
-        self._alone(lambda: self._keep(key, value))
+        self._if_unlocked(lambda: self._store(key, value))
         return value
 
     def get_by_value(self, tensors: Iterable[Tensor], compute: Callable[[], T]) -> T:
-        """The same by what tensors say; where more than numbers goes along with them, it is found anew."""
+        """Return the value for tensors of equal content, or compute it.
+
+        Where ``value_key`` gives no key, for instance because a tensor carries a gradient, the value is not cached.
+        """
         key = value_key(*tensors)
         return compute() if key is None else self.get_or_compute(key, compute)
 
-    def _known(self, key: Hashable) -> tuple[T, int] | None:
-        found = self._kept.get(key)
-        if found is not None:
-            self._kept.move_to_end(key)
-        return found
+    def _look_up(self, key: Hashable) -> tuple[T, int] | None:
+        entry = self._entries.get(key)
+        if entry is not None:
+            self._entries.move_to_end(key)
+        return entry
 
-    def _keep(self, key: Hashable, value: T) -> None:
+    def _store(self, key: Hashable, value: T) -> None:
         parts = key if isinstance(key, tuple) else (key,)
-        size = self._size(value) + sum(len(part) for part in parts if isinstance(part, bytes))
-        if key in self._kept or size > self.max_bytes:
+        size = self._size_in_bytes(value) + sum(len(part) for part in parts if isinstance(part, bytes))
+        if key in self._entries or size > self.max_bytes:
             return
-        self._kept[key] = value, size
+        self._entries[key] = value, size
         self._bytes += size
         while self._bytes > self.max_bytes:
-            self._bytes -= self._kept.popitem(last=False)[1][1]
+            self._bytes -= self._entries.popitem(last=False)[1][1]
 
-    def _alone(self, work: Callable[[], S]) -> S | None:
+    def _if_unlocked(self, work: Callable[[], S]) -> S | None:
         if not self._lock.acquire(blocking=False):
             return None
         try:
@@ -90,9 +96,10 @@ class LRUCache(Generic[T]):
 
 
 def value_key(*tensors: Tensor) -> tuple[Hashable, ...] | None:
-    """What tensors say, by which it can be told from anything else; None where more than numbers goes along with them.
+    """Return a key made of types, shapes and numbers of the tensors, or None where they are more than numbers.
 
-    Their owner may write to them at any time, by numpy unseen.
+    None for tensors that carry gradients or tangents, lie on another device or are subclasses. Versions are not enough
+    here: the owner of a tensor may write to it through numpy.
     """
     if under_torch_transform() or torch.is_inference_mode_enabled() or not all(map(_is_plain, tensors)):
         return None
@@ -102,12 +109,14 @@ def value_key(*tensors: Tensor) -> tuple[Hashable, ...] | None:
 
 
 def bytes_of(*tensors: Tensor) -> int:
-    """Bytes."""
+    """Return the bytes that the elements of tensors take together."""
     return sum(t.numel() * t.element_size() for t in tensors)
 
 
 def _is_plain(tensor: Tensor) -> bool:
-    elsewhere = tensor.device.type != "cpu" or tensor.layout != torch.strided or tensor.dtype not in CACHEABLE_DTYPES
-    if type(tensor) is not Tensor or elsewhere or tensor.is_inference():
+    unsupported = (
+        tensor.device.type != "cpu" or tensor.layout != torch.strided or tensor.dtype not in CACHEABLE_DTYPES
+    )
+    if type(tensor) is not Tensor or unsupported or tensor.is_inference():
         return False
     return not (tensor.requires_grad and torch.is_grad_enabled())

@@ -1,4 +1,4 @@
-"""Files that are there whole or not at all, and folders for them."""
+"""Atomic writing of files, JSON text, and checks of output folders."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ from typing import Any
 
 from ..errors import InvalidInput
 
-PROGRESS_FOLDER_NAME = "progress"  # folder in an output folder, while the work is not done
+PROGRESS_FOLDER_NAME = "progress"  # within an output folder, while the work is not done
 
 
 @contextmanager
 def write_atomically(path: Path) -> Iterator[Path]:
-    """A name beside ``path`` to write to; it becomes ``path`` when the block ends well, and is removed otherwise."""
+    """Yield a temporary path next to ``path``: renamed to ``path`` when the block ends well, removed otherwise."""
     path.parent.mkdir(parents=True, exist_ok=True)
     part = path.with_name(f".{path.stem}.{uuid.uuid4().hex}{path.suffix}")
     try:
@@ -31,7 +31,7 @@ def write_atomically(path: Path) -> Iterator[Path]:
         finally:
             part.unlink(missing_ok=True)
     except OSError as error:
-        if str(error.filename) == str(part):  # a name that nobody has given
+        if str(error.filename) == str(part):  # the user does not know the temporary name
             error.filename, error.filename2 = str(path), None
         raise
 
@@ -44,7 +44,7 @@ def write_text(path: Path, text: str) -> Path:
 
 
 def to_json(content: Any) -> str:
-    """Text of a result; what is not a finite number is null."""
+    """Return the JSON text of a result; numbers that are not finite become null."""
     return json.dumps(_finite(content), indent=1, allow_nan=False) + "\n"
 
 
@@ -57,16 +57,16 @@ def _finite(value: Any) -> Any:
 
 
 def check_output_folder(path: Path, option: str = "--out") -> None:
-    """Refuse, before any work is done, a folder that cannot be made or written to; leaves nothing behind.
+    """Check that a folder can be made and written to, before any work is done; leave nothing behind.
 
     Raises:
-        InvalidInput: the path, or what should be a folder above it, is a file, or the system lets nothing be made.
+        InvalidInput: the path or one of its parents is a file, or the system does not allow to write there.
     """
     plain = Path(os.path.abspath(path))
     above = next(part for part in (plain, *plain.parents) if os.path.lexists(part) or part == part.parent)
     if not above.is_dir():
         raise InvalidInput(option, got=f"{above}, a file", expected="a folder, new or existing")
-    try:  # in a place of its own: two commands may make the same folder at once
+    try:  # in a temporary folder: two commands may make the same one at once
         with tempfile.TemporaryDirectory(prefix=".torchcloth-", dir=above) as trial:
             (Path(trial) / plain.relative_to(above)).mkdir(parents=True, exist_ok=True)
     except OSError as error:

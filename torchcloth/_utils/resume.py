@@ -1,7 +1,7 @@
-"""What a search has computed, on disk: a search that was stopped is run again and finds its answers there.
+"""Resumable store: what a run has computed, on disk. A run that was stopped is started again and finds its answers.
 
-A search is deterministic, so the second run takes the same way, bit by bit, and computes only what the first did not.
-That holds for every estimator alike, and there is no state of a search that could be forgotten.
+The computation must be deterministic. The second run then takes the same path, bit by bit, and computes only what the
+first did not. That works for every estimator, and there is no state of a search that could be forgotten.
 """
 
 from __future__ import annotations
@@ -22,36 +22,45 @@ from ..errors import InvalidInput
 from .files import write_atomically, write_text
 
 STORE_FORMAT_VERSION = 2
-MAX_WRITE_ATTEMPTS = 3  # of writing an answer
-STAMP_FILE_NAME = "problem"  # file that makes a folder a journal
-DAMAGED_FILE_ERRORS = (RuntimeError, KeyError, ValueError, EOFError, OSError, pickle.UnpicklingError)  # torch's, of half a file
+MAX_WRITE_ATTEMPTS = 3
+STAMP_FILE_NAME = "problem"  # the file that makes a folder a store
+# what torch raises when it loads a missing or half-written file
+DAMAGED_FILE_ERRORS = (RuntimeError, KeyError, ValueError, EOFError, OSError, pickle.UnpicklingError)
 T = TypeVar("T", bound=Sequence)
 
 
 class ResumableStore:
-    """Answers by question in a folder, one file each; no other problem's, though one may be at work there as well.
+    """Results in a folder, one file for each name and inputs, all of one problem.
+
+    Several runs may use the folder at the same time.
 
     Args:
-        folder: made when the first answer is written; it must be a journal's or not exist.
-        problem: what the answers depend on beside the questions: data, model, options.
-        resume: take up what the folder holds; False: empty it; None: neither, there must be nothing.
+        folder: made when the first result is written. It must be a store or not exist.
+        problem: what the results depend on besides their inputs: data, model, options.
+        resume: True: continue with the results in the folder. False: empty it. None: neither; there must be no store.
+
+    Attributes:
+        folder: the folder.
+        key: fingerprint of the problem and of the program.
+        reused_count: how many results were read from the folder.
 
     Raises:
-        InvalidInput: nothing to resume, a journal of another problem or program, a folder of other things, or, where
-            nothing was said, work that was stopped.
+        InvalidInput: nothing to resume, a store of another problem or program, a folder with other content, or an
+            interrupted run where ``resume`` is None.
     """
 
     def __init__(self, folder: str | Path, problem: Sequence[object], resume: bool | None) -> None:
-        self.folder, self.key = Path(folder), digest([STORE_FORMAT_VERSION, torch.__version__, source_fingerprint(), *problem])
+        self.folder = Path(folder)
+        self.key = digest([STORE_FORMAT_VERSION, torch.__version__, source_fingerprint(), *problem])
         self.reused_count = 0
         stamp = self.folder / STAMP_FILE_NAME
         if not resume:
             if resume is None and stamp.exists():
-                same = stamp.read_text() == self.key
+                is_same = stamp.read_text() == self.key
                 raise InvalidInput(
                     "resume",
-                    got=f"nothing, and in {self.folder} {'the same' if same else 'other'} work, stopped",
-                    expected="--resume, to go on from there, or another folder" if same else "another folder",
+                    got=f"nothing, and in {self.folder} {'the same' if is_same else 'other'} work, stopped",
+                    expected="--resume, to go on from there, or another folder" if is_same else "another folder",
                     remedy=f"to start over, delete {self.folder}",
                 )
             clear_store(self.folder)
@@ -72,30 +81,36 @@ class ResumableStore:
             )
 
     def get_or_compute(self, name: str, inputs: Tensor, compute: Callable[[], T]) -> T:
-        """The answer of before, or that of ``work``, which is kept: a tuple of tensors."""
+        """Return the stored result for this name and these inputs, or compute and store it.
+
+        Args:
+            name: beginning of the file's name.
+            inputs: tensor that the result depends on.
+            compute: returns a tuple of tensors.
+        """
         path = self.folder / f"{name}-{digest([self.key, inputs])}.pt"
         try:
-            answer = torch.load(path, weights_only=True)
+            result = torch.load(path, weights_only=True)
             self.reused_count += 1
-            return answer
+            return result
         except DAMAGED_FILE_ERRORS:
-            answer = compute()
-        self._write(path, tuple(answer))
-        return answer
+            result = compute()
+        self._write(path, tuple(result))
+        return result
 
-    def _write(self, path: Path, answer: tuple) -> None:
-        for _ in range(MAX_WRITE_ATTEMPTS):  # another run into this folder that has ended takes it away
+    def _write(self, path: Path, result: tuple) -> None:
+        for _ in range(MAX_WRITE_ATTEMPTS):  # another run that has ended may remove the folder meanwhile
             with suppress(FileNotFoundError):
                 if not (self.folder / STAMP_FILE_NAME).exists():
-                    write_text(self.folder / STAMP_FILE_NAME, self.key)  # several answers may come at once
+                    write_text(self.folder / STAMP_FILE_NAME, self.key)  # several results may come at once
                 with write_atomically(path) as part:
-                    torch.save(answer, part)
+                    torch.save(result, part)
                 return
 
 
 @cache
 def source_fingerprint(*more_folders: Path) -> str:
-    """A fingerprint of the sources of the library, and of folders beside: what other code said is no answer."""
+    """Return a fingerprint of the library's sources and of ``more_folders``; results of other code are not reused."""
     folders = [Path(str(files(name))) for name in ("torchcloth", "torchcloth.robots")]
     parts: list[object] = []
     for folder in (*folders, *more_folders):
@@ -105,16 +120,19 @@ def source_fingerprint(*more_folders: Path) -> str:
 
 
 def clear_store(folder: Path) -> None:
-    """Remove a journal, if there is one: its stamp last, so that what is left by an interruption is a journal still.
+    """Remove a store, if there is one.
+
+    Its stamp goes last, so that what an interruption leaves is still a store.
 
     Raises:
-        InvalidInput: a folder of other things.
+        InvalidInput: a folder with other content.
     """
     if not folder.exists():
         return
     stamp = folder / STAMP_FILE_NAME
     inside = [path for path in folder.iterdir() if path != stamp]
-    if not stamp.exists() and any(not path.name.startswith(f".{STAMP_FILE_NAME}.") for path in inside):  # these are half a stamp
+    unfinished_stamp = f".{STAMP_FILE_NAME}."
+    if not stamp.exists() and any(not path.name.startswith(unfinished_stamp) for path in inside):
         raise InvalidInput("journal", got=f"{folder} with other content", expected="a new folder, or a journal")
     for path in (*inside, stamp):
         path.unlink(missing_ok=True)
@@ -123,9 +141,9 @@ def clear_store(folder: Path) -> None:
 
 
 def digest(parts: Sequence[object]) -> str:
-    """A fingerprint of tensors and of whatever prints in full."""
-    found = hashlib.sha256()
+    """Return a fingerprint of tensors and of objects whose ``repr`` shows all of their content."""
+    sha = hashlib.sha256()
     for part in parts:
         data = part.detach().contiguous().numpy().tobytes() if isinstance(part, Tensor) else repr(part).encode()
-        found.update(len(data).to_bytes(8, "little") + data)
-    return found.hexdigest()[:24]
+        sha.update(len(data).to_bytes(8, "little") + data)
+    return sha.hexdigest()[:24]

@@ -1,4 +1,4 @@
-"""Modes of torch that a caller may be in, and that a computation here must not be in."""
+"""Modes of torch that a caller may be in, and that a computation of the library must not be in."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ AUTOCAST_DEVICE_TYPES = ("cpu", "cuda")
 
 @contextmanager
 def disable_autocast() -> Iterator[None]:
-    """Without autocast, whose eight bits of mantissa are millimetres at a metre's reach, and without a default device.
+    """Disable autocast and the default device within the block.
 
-    What is made on the way is made beside the tensors that are given, or on the CPU.
+    Eight bits of mantissa are millimetres at one metre. New tensors lie with those that are given, or on the CPU.
     """
     with ExitStack() as stack:
         for device in AUTOCAST_DEVICE_TYPES:
@@ -28,12 +28,15 @@ def disable_autocast() -> Iterator[None]:
 
 @contextmanager
 def isolated_grad_mode() -> Iterator[None]:
-    """With gradients, whatever the caller wants of his own tensors, and disable_autocast."""
+    """Enable gradients within the block whatever mode the caller is in, and disable autocast."""
     with torch.inference_mode(False), torch.enable_grad(), disable_autocast():
         yield
 
 
 def under_torch_transform() -> bool:
-    """Whether something goes along with numbers, or looks at what is done to them, other than a backward pass."""
+    """Return whether tensors carry tangents or batches of a transform, or a mode watches operations on them.
+
+    A backward pass does not count.
+    """
     watched = torch._C._are_functorch_transforms_active() or torch._C._len_torch_dispatch_stack() > 0
     return watched or forward_ad._current_level >= 0 or torch.compiler.is_compiling()

@@ -1,4 +1,4 @@
-"""Points and directions that a user gives."""
+"""Points, directions and other short lists of numbers that a user gives."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from ..errors import InvalidInput
 
 
 def parse_unit_vector(what: str, given: Sequence[float]) -> Tensor:
-    """[3] unit vector.
+    """Return the given direction as a unit vector [3].
 
     Raises:
         InvalidInput: not three finite numbers, or all zero.
@@ -25,7 +25,7 @@ def parse_unit_vector(what: str, given: Sequence[float]) -> Tensor:
 
 
 def parse_vector(what: str, given: Sequence[float]) -> Tensor:
-    """[3] a point or vector.
+    """Return the given point or vector as a tensor [3].
 
     Raises:
         InvalidInput: not three finite numbers.
@@ -34,10 +34,16 @@ def parse_vector(what: str, given: Sequence[float]) -> Tensor:
 
 
 def parse_finite_numbers(what: str, given: Sequence[float], count: int, expected: str) -> Tensor:
-    """[count] finite numbers, which ``expected`` describes.
+    """Return the given numbers as a tensor [count] of the default precision.
+
+    Args:
+        what: name for messages.
+        given: the numbers.
+        count: how many there must be.
+        expected: description of valid numbers, for messages.
 
     Raises:
-        InvalidInput: something else.
+        InvalidInput: another count, no numbers, or numbers that are not finite.
     """
     check_has_no_gradient(what, given)
     try:
@@ -50,10 +56,10 @@ def parse_finite_numbers(what: str, given: Sequence[float], count: int, expected
 
 
 def check_has_no_gradient(what: str, given: object) -> None:
-    """Refuse a tensor whose gradients would be lost, as a part keeps a copy.
+    """Refuse a tensor that requires gradients, which would vanish because a part keeps a copy.
 
     Raises:
-        InvalidInput: it wants gradients.
+        InvalidInput: the tensor requires gradients.
     """
     if isinstance(given, Tensor) and given.requires_grad and torch.is_grad_enabled():
         remedy = "its detach(); what a network gives goes in by torch.func.functional_call, as a parameter of the cloth"
