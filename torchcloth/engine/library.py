@@ -2,7 +2,7 @@
 
 One that came with the package (``pip install`` builds it where there is a compiler) serves if it is right for this
 processor; otherwise it is built once into the cache: ``$TORCHCLOTH_CACHE``, or ``~/.cache/torchcloth``, or a temporary
-folder where those cannot be written to.
+folder where those cannot be written to. Without a compiler the portable library of a wheel serves, if there is one.
 """
 
 from __future__ import annotations
@@ -83,7 +83,7 @@ def kernels() -> dict[str, tuple[int, int, int]]:
 def status() -> str:
     """Whether it is built, or can be, in a line; builds nothing."""
     if (file := _there()) is not None:
-        return f"built: {file}"
+        return f"{'portable' if file == building.find_portable(PACKAGED) else 'built'}: {file}"
     try:
         return f"will be built at first use, with {building.version(building.compiler())}"
     except Unbuilt as miss:
@@ -93,7 +93,13 @@ def status() -> str:
 def _there() -> Path | None:
     """The file, if it was built."""
     packaged = PACKAGED / building.file_name()
-    return packaged if packaged.exists() else building.cached()
+    if (file := packaged if packaged.exists() else building.cached()) is not None:
+        return file
+    try:
+        building.compiler()  # that builds a faster one
+    except Unbuilt:
+        return building.find_portable(PACKAGED)
+    return None
 
 
 @cache
@@ -110,6 +116,9 @@ def _found() -> ctypes.CDLL | Unbuilt:
     try:
         return _loaded(building.cached() or building.build())
     except Unbuilt as miss:
+        with suppress(OSError):
+            if (portable := building.find_portable(PACKAGED)) is not None:
+                return _loaded(portable)
         return miss
     except OSError as error:
         return Unbuilt(f"the engine's library does not load: {error}", "delete it, or set TORCHCLOTH_CACHE elsewhere")
