@@ -2,8 +2,8 @@
 
 ``tc.Cloth`` is the layer; ``tc.meshes``, ``tc.materials``, ``tc.effects``, ``tc.boundaries`` are its parts;
 ``tc.robots`` gives end-effector poses, ``tc.recordings`` episodes, ``tc.identify`` parameters with errors,
-``tc.estimate_pose`` the mesh over time, ``tc.diagnose`` what a simulation of episodes gets wrong,
-``tc.load`` the model that it was extended to, ``tc.plan`` a motion after which the cloth lies where it shall.
+``tc.estimate_pose`` the mesh over time. ``tc.diagnose`` names what a simulation of episodes gets wrong, and ``tc.load``
+reads the extended model that it wrote. ``tc.plan`` finds a motion that brings the cloth to a goal.
 """
 
 from __future__ import annotations
@@ -62,7 +62,7 @@ LAZY_FUNCTIONS = {
     "identify": "identification",
     "load": "diagnosis",
     "plan": "planning",
-}  # function: its room
+}  # function: its subpackage
 
 
 def __dir__() -> list[str]:
@@ -70,7 +70,7 @@ def __dir__() -> list[str]:
 
 
 def __getattr__(name: str):
-    """Rooms that are opened when they are first asked for: importing the layer stays cheap."""
+    """Import a subpackage or function when it is first used, so that importing the layer stays cheap."""
     if name in LAZY_SUBPACKAGES:
         return import_module(f".{name}", __name__)
     if name in LAZY_FUNCTIONS:

@@ -1,4 +1,4 @@
-"""The layer: a cloth as an nn.Module."""
+"""The layer: a cloth as an ``nn.Module``."""
 
 from __future__ import annotations
 
@@ -41,12 +41,19 @@ from .simulation.argument_checks import (
     check_step,
     check_substeps,
     check_times,
-    mesh_warnings,
     expand_state,
+    mesh_warnings,
 )
 from .simulation.bound_modules import BoundModuleDict, check_not_bound_elsewhere
-from .simulation.initial_state import with_mass_damping, initial_state, stationary_motion, template_state, random_contact_state, require_at_rest
-from .simulation.rollout import RolloutSchedule, subdivide_intervals, run_schedule
+from .simulation.initial_state import (
+    initial_state,
+    random_contact_state,
+    require_at_rest,
+    stationary_motion,
+    template_state,
+    with_mass_damping,
+)
+from .simulation.rollout import RolloutSchedule, run_schedule, subdivide_intervals
 from .simulation.sensitivities import Directions, compute_sensitivities
 from .types import ClothState, Rollout, Trajectory
 
@@ -58,14 +65,14 @@ class Cloth(nn.Module):
         mesh: the triangles and their rest shape.
         material: the constitutive law.
         areal_density: rho_A [kg/m^2]; scalar or one value per triangle; learnable.
-        effects: forces by name, e.g. ``{"gravity": Gravity(), "air": AirDrag()}``. None: none, not even weight.
+        effects: by name, e.g. ``{"gravity": Gravity(), "air": AirDrag()}``. None: no effects, not even weight.
         boundaries: grasps and colliders by name, applied in order.
-        contact: discretisation of contact between layers; None leaves contact out, and with it the parameters k, gamma
-            and c_F of the material.
-        engine: what computes the substeps. "auto": the fused engine (C++, CUDA C++; in float32 or float64) where it
-            knows the parts, else the torch reference, on CUDA in graphs; ``print`` of the cloth tells which and why.
-            "fused": an error where it cannot. "reference": always torch, on CUDA launched one by one. The attribute of
-            the same name may be set at any time.
+        contact: discretisation of contact between layers. None: no contact, and the parameters k, gamma and c_F of the
+            material have no effect.
+        engine: what computes the substeps. "auto": the fused engine (C++, CUDA C++; float32 or float64) if it knows
+            all parts, else the torch reference, on CUDA in graphs; ``print(cloth)`` says which and why. "fused": raise
+            an error if the engine cannot. "reference": always torch, on CUDA launched one by one. The attribute of the
+            same name may be set at any time.
 
     Raises:
         InvalidInput: a part that does not fit.
@@ -105,15 +112,15 @@ class Cloth(nn.Module):
         self.effects, self.boundaries = BoundModuleDict("effects", mesh), BoundModuleDict("boundaries", mesh)
         self.effects.update(effects)
         self.boundaries.update(boundaries)
-        check_grasps(dict(self._parts()), self.boundaries)
+        check_grasps(dict(self._named_effects()), self.boundaries)
         self._contact, self._grid = contact, None if contact is None else contact.build_grid(mesh)
-        of_contact = () if self._grid is None else self._grid.contact_warnings(mesh)
-        for doubt in (*mesh_warnings(mesh, self.areal_density.value), *of_contact):
-            warnings.warn(doubt, stacklevel=2)
+        contact_warnings = () if self._grid is None else self._grid.contact_warnings(mesh)
+        for text in (*mesh_warnings(mesh, self.areal_density.value), *contact_warnings):
+            warnings.warn(text, stacklevel=2)
         self._store_geometry()
-        for own in (*self.parameters(), *self.buffers()):  # tensors keep their precision until a cloth has one
-            if own.is_floating_point():
-                own.data = own.data.to(self._area.dtype)
+        for tensor in (*self.parameters(), *self.buffers()):  # parts take the precision of the cloth
+            if tensor.is_floating_point():
+                tensor.data = tensor.data.to(self._area.dtype)
 
     def _store_geometry(self) -> None:
         gradient, area = self.mesh.shape_gradient, self.mesh.area
@@ -132,12 +139,12 @@ class Cloth(nn.Module):
 
     @property
     def contact(self) -> Contact | None:
-        """Between layers; None: they pass through each other. A cloth keeps what it was made with."""
+        """Discretisation of the contact between layers, fixed at construction; None: layers pass through each other."""
         return self._contact
 
     @property
     def engine(self) -> Setting:
-        """What computes the substeps: "auto", "reference" or "fused"."""
+        """Engine setting: "auto", "reference" or "fused"."""
         return self._engine
 
     @engine.setter
@@ -146,24 +153,32 @@ class Cloth(nn.Module):
 
     @property
     def engine_in_use(self) -> str:
-        """What computes the substeps: "fused", "fused, with effects.NAME in torch", or "reference (and why)".
+        """Engine that computes the substeps: "fused", "fused, with effects.NAME in torch", or "reference (reason)".
 
-        A device is tried at the first call, after which this may say that the reference serves.
+        A device is tested at the first call; after a failed test this says that the reference is used.
         """
         with torch.no_grad(), disable_autocast():
-            model, _ = self._stepping()
-            return str(self._choice(model, template_state(model, self._vertices)))
+            model, _ = self._model_and_step()
+            return str(self._choose_engine(model, template_state(model, self._vertices)))
 
     # -- states ---------------------------------------------------------------------------------------------------
 
     @disable_autocast()
     def rest_state(self) -> ClothState:
-        """The mesh as it was given, at rest."""
-        return self.state(self._vertices.clone())  # what a caller does to it is not done to the cloth
+        """Return the state of the mesh as it was given, at rest."""
+        return self.state(self._vertices.clone())  # a caller may write to the state
 
     @disable_autocast()
     def state(self, x: Tensor, v: Tensor | None = None) -> ClothState:
-        """A state from vertex positions [..., V, 3] m and velocities (None: at rest), directors along the normals."""
+        """Build a state with directors along the normals and no memory.
+
+        Args:
+            x: [..., V, 3] m, vertex positions.
+            v: [..., V, 3] m/s, vertex velocities; None: at rest.
+
+        Raises:
+            InvalidInput: shapes that do not fit, or numbers that are not finite.
+        """
         check_precision(self._area.dtype)
         x = as_positions("x", x, self._area)
         v = torch.zeros_like(x) if v is None else as_positions("v", v, x)
@@ -181,14 +196,17 @@ class Cloth(nn.Module):
         dt: float | None = None,
         checkpoint: bool = True,
     ) -> Rollout:
-        """Simulate from ``state`` at ``times[0]`` to the last time.
+        """Simulate from ``state`` at ``times[0]`` to the last of ``times``.
 
         Args:
             state: initial state, with or without leading batch dimensions.
             motion: a trajectory for every driven boundary, by the boundary's name; poses may be batched.
-            times: [T] s, frame times, increasing; substeps are laid between them so that frames are met exactly.
-            dt: largest substep [s]; None chooses the stable one.
-            checkpoint: store only frames and recompute substeps in the backward pass.
+            times: [T] s, frame times, increasing. Substeps divide the intervals between them, so frames are exact.
+            dt: largest substep [s]; None: ``stable_step()``.
+            checkpoint: store only frames, and recompute substeps in the backward pass.
+
+        Returns:
+            Positions, velocities and wrenches at the frames, and the last state.
 
         Raises:
             InvalidInput: motion that does not fit the boundaries or the times.
@@ -207,21 +225,23 @@ class Cloth(nn.Module):
         duration: float = 0.3,
         rate: float = 30.0,
     ) -> ClothState:
-        """Let the cloth come to rest with every driven body held where it is at ``start`` [s].
+        """Let the cloth come to rest while every driven body stands where it is at ``start`` [s].
 
-        Measured initial positions carry noise, which would ring through an undamped simulation: this damps it. Cloth
-        that has far to go is slowed down and stopped on its way, with a warning: simulate it instead, or settle it for
-        seconds at a smaller rate.
+        Measured initial positions carry noise, which would ring through an undamped simulation. Cloth that has far to
+        move is stopped on its way, with a warning: simulate it instead, or settle it for seconds at a smaller rate.
 
         Args:
             state: measured or guessed state.
             motion: as for ``forward``.
             start: time at which the bodies stand.
             duration: simulated time [s].
-            rate: of the mass damping that is added meanwhile [1/s].
+            rate: rate of the mass damping that is added meanwhile [1/s].
+
+        Returns:
+            The settled state, with all velocities zero.
         """
-        settled = run_schedule(self.schedule_settling(state, motion or {}, start, duration, rate), checkpoint=True).state
-        return require_at_rest(settled, duration, level=3)
+        schedule = self.schedule_settling(state, motion or {}, start, duration, rate)
+        return require_at_rest(run_schedule(schedule, checkpoint=True).state, duration, level=3)
 
     def sensitivities(
         self,
@@ -233,20 +253,20 @@ class Cloth(nn.Module):
         dt: float | None = None,
         settle: float = 0.0,
     ) -> tuple[Rollout, Rollout]:
-        """Simulate, and differentiate in K directions at once, by forward mode: exact, for the price of a few runs.
+        """Simulate, and differentiate along K directions at once by forward mode: exact, at the cost of a few runs.
 
         Memory does not grow with the number of substeps. Neither result is part of an autograd graph.
 
         Args:
-            state: as for ``forward``, like motion, times and dt.
-            motion: likewise.
-            times: likewise.
-            dt: likewise.
+            state: as for ``forward``.
+            motion: as for ``forward``.
+            times: as for ``forward``.
+            dt: as for ``forward``.
             along: the directions.
-            settle: first let the cloth come to rest for so long [s], as ``settle`` does; 0: not.
+            settle: time [s] for which the cloth first comes to rest, as ``settle`` does; 0: it does not.
 
         Returns:
-            The rollout, and its derivatives, which have K in front of every shape but that of ``t``.
+            The rollout; and its derivatives, whose tensors have K in front of every shape but that of ``t``.
 
         Raises:
             InvalidInput: directions that do not fit, and as ``forward``.
@@ -254,21 +274,21 @@ class Cloth(nn.Module):
         return compute_sensitivities(self, state, motion or {}, times, along, dt, settle)
 
     def clip_(self) -> None:
-        """Take amplitudes that an optimiser's step has made negative back to zero; call it after every step."""
+        """Set negative values of nonnegative parameters to zero; call this after every step of an optimiser."""
         for part in self.modules():
             if isinstance(part, PhysicalParameter):
                 part.clip_()
 
     @disable_autocast()
     def stable_step(self) -> float:
-        """The substep [s] that is used by default, from the stiffest element and the present parameters."""
-        return self._stepping()[1]
+        """Compute the default substep [s] from the stiffest element and the present parameters."""
+        return self._model_and_step()[1]
 
     def build_model(self) -> Model:
-        """The parts with their parameters resolved to tensors, as ``functional`` takes them."""
+        """Build the model that ``dynamics.substep`` advances: the parts, with their parameters resolved to tensors."""
         geometry = Geometry.from_shape_gradients(self._corners, self._gradient, self._area)
         mass = vertex_mass(geometry, self.areal_density.value, self._vertex_area)
-        effects = {name: (effect, effect.coefficients()) for name, effect in self._parts()}
+        effects = {name: (effect, effect.coefficients()) for name, effect in self._named_effects()}
         for effect, c in effects.values():
             extra = effect.mass(c)
             mass = mass if extra is None else mass + extra
@@ -281,12 +301,14 @@ class Cloth(nn.Module):
             effects=effects,
             boundaries=dict(self.boundaries.items()),  # type: ignore[arg-type]
             grid=self.contact_grid(),
-            inverse_rest_deformation=inverse_rest_deformation(effect.rest_deformation(c) for effect, c in effects.values()),
+            inverse_rest_deformation=inverse_rest_deformation(
+                effect.rest_deformation(c) for effect, c in effects.values()
+            ),
         )
 
     @disable_autocast()
     def energy(self, state: ClothState) -> dict[str, Tensor]:
-        """Energies by name, each [...] J."""
+        """Compute the energies by name, each [...] J: kinetic, membrane, and director where there is contact."""
         model = self.build_model()
         check_state(state, template_state(model, self._vertices), finite=False)
         return substep.energy(model, state)
@@ -294,44 +316,44 @@ class Cloth(nn.Module):
     def schedule(
         self, state: ClothState, motion: Mapping[str, Trajectory], times: Tensor | Sequence[float], dt: float | None
     ) -> RolloutSchedule:
-        """What ``forward`` does, checked."""
+        """Check the arguments of ``forward``, and return the schedule that it runs."""
         frames = check_times(times)
         motion = check_motions(motion, self.boundaries, frames, self._area)
-        model, limit = self._stepping(dt)
+        model, limit = self._model_and_step(dt)
         check_substeps(frames[-1] - frames[0], limit, dt)
         counts = [max(1, int(np.ceil((end - start) / limit - 1e-9))) for start, end in pairwise(frames)]
-        return self._ready(model, state, motion, frames, counts, dt=dt)
+        return self._build_schedule(model, state, motion, frames, counts, dt=dt)
 
     def schedule_settling(
         self, state: ClothState, motion: Mapping[str, Trajectory], start: float, duration: float, rate: float
     ) -> RolloutSchedule:
-        """What ``settle`` does, checked."""
+        """Check the arguments of ``settle``, and return the schedule that it runs."""
         frames = [start, start + duration]
         motion = check_motions(stationary_motion(motion, *frames), self.boundaries, frames, self._area)
-        model, step = self._stepping()
+        model, step = self._model_and_step()
         check_rate(rate)
         check_substeps(duration, 1 / (1 / step + rate))
         count = int(np.ceil(duration * (1 / step + rate)))
-        return self._ready(model, state, motion, frames, [count], rate)
+        return self._build_schedule(model, state, motion, frames, [count], rate)
+
+    def contact_grid(self) -> Grid | None:
+        """Return the contact grid on the cloth's device, or None without contact."""
+        return None if self._grid is None else self._grid._replace(points=self._points, non_adjacent=self._non_adjacent)
 
     # -- parts of the above ---------------------------------------------------------------------------------------
 
-    def _parts(self) -> Iterable[tuple[str, AbstractEffect]]:
+    def _named_effects(self) -> Iterable[tuple[str, AbstractEffect]]:
         return cast("Iterable[tuple[str, AbstractEffect]]", self.effects.items())
 
-    def contact_grid(self) -> Grid | None:
-        """The contact grid; None without contact."""
-        return None if self._grid is None else self._grid._replace(points=self._points, non_adjacent=self._non_adjacent)
-
-    def _stepping(self, dt: float | None = None) -> tuple[Model, float]:
-        """The parts, with the stages that the step needs, and the step [s]: the stable one, or the user's."""
+    def _model_and_step(self, dt: float | None = None) -> tuple[Model, float]:
+        """Return the model with the stages that the step needs, and the step [s]: the stable one, or the user's."""
         check_parameters(self)
         model = self.build_model()
         limits = stability_limits(model, self._gradient)
         step = check_step(dt, limits.cheapest_step)
         return model._replace(stages=limits.stages_for(step)), step
 
-    def _ready(
+    def _build_schedule(
         self,
         model: Model,
         state: ClothState,
@@ -345,41 +367,43 @@ class Cloth(nn.Module):
         if settling is not None:
             model = with_mass_damping(model, settling)
         state = expand_state(state, model, motion)
-        longest = float("inf") if self._grid is None else self._grid.max_extent
+        max_extent = float("inf") if self._grid is None else self._grid.max_extent
         steps = [(end - start) / count for (start, end), count in zip(pairwise(frames), counts, strict=True)]
-        choice, step_for, asked = self._choice(model, state, min(steps, default=None)), None, None
+        choice, step_for, requested_frames = self._choose_engine(model, state, min(steps, default=None)), None, None
         if MATERIAL_MEMORY_KEY in state.memory:
-            frames, counts, asked = subdivide_intervals(frames, counts)
+            frames, counts, requested_frames = subdivide_intervals(frames, counts)
             step_for = self._step_for(model, dt)
         graphs = Graphs(model, sum(counts)) if choice.captured else None
-        plan = RolloutSchedule(model, motion, frames, counts, state, choice, longest, step_for, asked, graphs)
-        plan.check_extent(state)
-        return plan
+        schedule = RolloutSchedule(
+            model, motion, frames, counts, state, choice, max_extent, step_for, requested_frames, graphs
+        )
+        schedule.check_extent(state)
+        return schedule
 
     def _step_for(self, model: Model, dt: float | None) -> Callable[[ClothState], float]:
-        """The longest substep [s] for a state, as what has set shortens it; the user's is held to it."""
+        """Return a function that gives the longest substep [s] for a state, which plastic set shortens."""
 
-        def longest(state: ClothState) -> float:
-            limit = stability_limits(model, self._gradient, state.memory[MATERIAL_MEMORY_KEY].detach()).stable_step(model.stages)
-            return check_step(dt, limit)
+        def longest_step(state: ClothState) -> float:
+            limits = stability_limits(model, self._gradient, state.memory[MATERIAL_MEMORY_KEY].detach())
+            return check_step(dt, limits.stable_step(model.stages))
 
-        return longest
+        return longest_step
 
-    def _choice(self, model: Model, state: ClothState, dt: float | None = None) -> Choice:
-        """``dt``: of the substeps [s]; None: there will be none."""
+    def _choose_engine(self, model: Model, state: ClothState, dt: float | None = None) -> Choice:
+        """Choose the engine; ``dt`` is the substep [s], or None if no substep will be run."""
         trial = None
         if dt is not None:
             trial = Trial(partial(random_contact_state, model, self._vertices, TRIED * dt / 2), dt / 2)
         return choose(self.engine, model, state, still_drives(model), trial)
 
     def extra_repr(self) -> str:
-        """Data sheet: size, contact, step."""
+        """Return the data sheet: size, contact, stable step and engine."""
         size = f"{len(self.mesh.vertices)} vertices, {len(self.mesh.faces)} triangles, {self.mesh.area.sum():.4g} m^2"
         if (pieces := self.mesh.piece_count) > 1:
             size += f", {pieces} pieces that nothing joins"
         grid = "none" if self._grid is None else self._grid.summary
         try:
             step, engine = f"{self.stable_step():.3g} s", self.engine_in_use
-        except TorchclothError as error:  # of a cloth that cannot be simulated, which one prints to see why
+        except TorchclothError as error:  # a cloth that cannot be simulated is printed to see why
             step, engine = str(error), "none"
         return f"{size}\ncontact: {grid}\nstable step: {step}\nengine: {engine}"

@@ -1,4 +1,4 @@
-"""Errors that tell a person what to do: what is wrong, what was got, what was expected, and the remedy."""
+"""Errors whose text says what is wrong, what was got, what was expected, and what to do."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ class TorchclothError(ValueError):
     """Base of every error that torchcloth raises on purpose; its text is one line.
 
     Args:
-        what: the thing that is wrong, in the caller's own argument names.
+        what: name of the wrong argument, as the caller knows it.
         got: the offending value or a short description of it.
         expected: what would have been accepted.
         remedy: what to do about it.
@@ -33,7 +33,7 @@ def _rebuild(cls: type[TorchclothError], what: str, got: object, expected: str, 
 
 
 class InvalidInput(TorchclothError):
-    """An argument that no simulation can be made from."""
+    """An argument that is not valid."""
 
 
 class RecordingError(TorchclothError):
@@ -45,8 +45,8 @@ class UnstableStep(TorchclothError):
 
 
 class SimulationDiverged(TorchclothError):
-    """The state lost finiteness; names the step and the first vertex."""
+    """A state that is no longer finite; the text names the step and the first vertex."""
 
 
 class MissingDependency(TorchclothError, ImportError):
-    """An optional package that the called feature needs."""
+    """An optional package that is not installed but needed."""

@@ -1,4 +1,4 @@
-"""Physical parameters: learnable, stored unconstrained, never out of their domain."""
+"""Physical parameters: learnable, stored unconstrained, always within their domain."""
 
 from __future__ import annotations
 
@@ -20,11 +20,10 @@ class _Interval(NamedTuple):
     lower: float
     upper: float
     includes_lower: bool
-    text: str
+    description: str
 
     @classmethod
-    def between(cls, lower: float, upper: float) -> _Interval:
-        """Open at both ends."""
+    def open_between(cls, lower: float, upper: float) -> _Interval:
         limits = [f"above {lower:g}"] * math.isfinite(lower) + [f"below {upper:g}"] * math.isfinite(upper)
         return cls(lower, upper, False, "a value " + " and ".join(limits))
 
@@ -44,17 +43,17 @@ _DOMAINS: dict[str, _Interval] = {
 class PhysicalParameter(nn.Module):
     """One physical quantity with its unit and domain; scalar, or a field with one value per element.
 
-    The stored tensor ``raw`` is unconstrained (log for positive, logit for (0, 0.5)), so any optimiser step stays
-    legal. Amplitudes of effects are ``nonnegative``: stored as they are, because amplitude 0 must be exactly zero and
-    keep a gradient there; after a step of an optimiser ``clip_`` takes them back (``tc.identify`` does so).
+    The stored tensor ``raw`` is unconstrained (log for positive, logit for (0, 0.5)), so every optimiser step stays in
+    the domain. Amplitudes of effects are ``nonnegative`` and stored as they are: amplitude 0 must be exactly zero, and
+    have a gradient there. After a step of an optimiser ``clip_`` sets negative values to zero (``tc.identify`` does).
 
     Args:
         value: physical value in ``unit``; a number or a tensor (one value per triangle, or [B, 1] for a batch).
         unit: SI unit, "-" when dimensionless.
         domain: "positive", "unit_half" (Poisson's ratio), "nonnegative" or "real".
-        name: how messages call it.
-        axes: trailing axes of its own, behind those of a batch.
-        within: open interval of a "real" parameter; a step of an optimiser that leaves it is told by the cloth.
+        name: name in messages.
+        axes: number of trailing axes of its own, after those of a batch.
+        bounds: open interval of a "real" parameter. The cloth raises an error after an optimiser step that leaves it.
 
     Raises:
         InvalidInput: no number or tensor, outside the domain or not finite.
@@ -75,7 +74,7 @@ class PhysicalParameter(nn.Module):
             raise InvalidInput("domain", got=repr(domain), expected=f"one of {sorted(_DOMAINS)}")
         self.unit, self.label, self.axes = unit, name, axes
         self.domain: Domain = domain
-        self._interval = _DOMAINS[domain] if bounds is None else _Interval.between(*bounds)
+        self._interval = _DOMAINS[domain] if bounds is None else _Interval.open_between(*bounds)
         self.raw = nn.Parameter(self._to_raw(value))
 
     @property
@@ -85,12 +84,16 @@ class PhysicalParameter(nn.Module):
 
     @property
     def field(self) -> Tensor:
-        """Physical value [..., E or 1, 1], as it meets fields [..., E, 3] of the triangles."""
+        """Physical value in ``unit``, [..., E or 1, 1], to broadcast with fields [..., E, 3] of the triangles."""
         value = self.value
         return value.unsqueeze(-1) if value.ndim else value.reshape(1, 1)
 
     def set(self, value: float | Tensor) -> None:
-        """Assign a physical value in place; refuses an illegal one and leaves the old value."""
+        """Assign a physical value in place.
+
+        Raises:
+            InvalidInput: a value outside the domain or of another shape; the old value stays.
+        """
         check_has_no_gradient(self.label, value)
         with torch.no_grad():
             new = self._to_raw(value, self.raw.dtype).to(self.raw)
@@ -101,21 +104,25 @@ class PhysicalParameter(nn.Module):
             self.raw.copy_(new)
 
     def check_in_domain(self, name: str, remedy: str) -> None:
-        """Refuse what a step of an optimiser may have brought where values are stored as they are.
+        """Check that an optimiser step has not left the domain, where values are stored as they are.
+
+        Args:
+            name: name of the parameter in the message.
+            remedy: what the message advises.
 
         Raises:
             InvalidInput: a value outside the domain.
         """
         if self.domain in ("nonnegative", "real") and not self._interval.contains(self.raw.detach()):
-            raise self._outside(name, self.raw.detach(), remedy)
+            raise self._domain_error(name, self.raw.detach(), remedy)
 
-    def _outside(self, name: str, tensor: Tensor, remedy: str = "") -> InvalidInput:
+    def _domain_error(self, name: str, tensor: Tensor, remedy: str = "") -> InvalidInput:
         shown = f"{tensor.item():g}" if tensor.numel() == 1 else f"a field in [{tensor.min():g}, {tensor.max():g}]"
-        return InvalidInput(name, got=f"{shown} {self.unit}", expected=self._interval.text, remedy=remedy)
+        return InvalidInput(name, got=f"{shown} {self.unit}", expected=self._interval.description, remedy=remedy)
 
     @torch.no_grad()
     def clip_(self) -> None:
-        """Take an amplitude that a step has made negative back to zero."""
+        """Set negative values of a nonnegative parameter to zero, in place."""
         if self.domain == "nonnegative":
             self.raw.clamp_(min=0.0)
 
@@ -131,7 +138,7 @@ class PhysicalParameter(nn.Module):
         if not tensor.is_floating_point():
             tensor = tensor.to(torch.get_default_dtype())
         if not self._interval.contains(tensor):
-            raise self._outside(self.label, tensor)
+            raise self._domain_error(self.label, tensor)
         if self.domain == "positive":
             tensor = tensor.log()
         elif self.domain == "unit_half":
@@ -139,22 +146,22 @@ class PhysicalParameter(nn.Module):
         return tensor if isinstance(value, Tensor) else tensor.to(dtype or torch.get_default_dtype())
 
     def extra_repr(self) -> str:
-        """One line of a data sheet."""
+        """Return the line of the data sheet: value and unit."""
         value = self.value.detach()
         shown = f"{value.item():.6g}" if value.numel() == 1 else f"field {tuple(value.shape)}, mean {value.mean():.6g}"
         return f"{shown} {self.unit}"
 
 
 def call_with_parameters(module: nn.Module, values: Mapping[str, Tensor], arguments: tuple) -> Any:
-    """``module(*arguments)`` with these in the place of its parameters.
+    """Return ``module(*arguments)`` with ``values`` in place of the parameters of these names.
 
-    Ties are left alone: torch would replace the parameters of a part that a cloth has twice, and not put them back.
+    Ties are left alone: torch would replace the parameters of a part that a cloth has twice, and not restore them.
     """
     return functional_call(module, dict(values), arguments, tie_weights=False)
 
 
 def to_physical(raw: Tensor, domain: Domain) -> Tensor:
-    """Map the stored number(s) to the physical value(s)."""
+    """Map stored numbers to physical values."""
     if domain == "positive":
         return raw.exp()
     if domain == "unit_half":

@@ -1,4 +1,7 @@
-"""The physics of one substep: kinematics, elasticity, forces, viscous stages, contact between layers, stability."""
+"""The physics of one substep: kinematics, elasticity, forces, viscous stages, contact between layers, stability.
+
+Start with ``substep``: it is the whole algorithm on one page, in order.
+"""
 
 from .kinematics import Geometry, surface
 from .model import Model

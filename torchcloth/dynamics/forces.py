@@ -46,7 +46,7 @@ def vertex_forces(
         compensation: as of ``substep.step``.
 
     Raises:
-        InvalidInput: an effect whose force has another shape than it promises, or whose viscous force acts on triangles.
+        InvalidInput: a force of another shape than its effect promises, or a viscous force that acts on triangles.
     """
     g = model.geometry
     p1, p2 = stress

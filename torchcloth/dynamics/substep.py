@@ -61,7 +61,7 @@ def step(
         prescribed: motion of the driven boundaries by name, one row per substep.
         substep: row of ``prescribed`` to use.
         contact_candidates: triangles that may touch another layer, from this or a nearby state; searched for if None.
-        compensation: [..., V, 3] m, rounding error of ``state.x`` that was carried over (Kahan summation, float32 only).
+        compensation: [..., V, 3] m, rounding error of ``state.x`` that is carried over (Kahan summation, float32 only).
 
     Returns:
         The state at the end of the substep, and the impulse [N s, N m s] that each driven boundary gave the cloth.

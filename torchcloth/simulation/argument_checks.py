@@ -1,4 +1,4 @@
-"""Checks of what a user hands to the layer. They raise with the argument's name; they never change physics."""
+"""Checks of the arguments that a user gives the layer. They raise with the argument's name and never change physics."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ import torch
 from torch import Tensor, nn
 
 from ..boundaries import AbstractBoundary, Grasp
-from ..boundaries.motion import check_trajectory as check_motion
 from ..boundaries.motion import check_covers_times
+from ..boundaries.motion import check_trajectory as check_motion
 from ..dynamics.contact import Contact
 from ..dynamics.model import Model, tree_map
 from ..effects import AbstractEffect
@@ -22,7 +22,7 @@ from ..parameters import PhysicalParameter
 from ..types import ClothState, Trajectory
 
 EXPECTED_FRAME_TIMES = "at least two, increasing, finite seconds"
-MAX_SUBSTEPS_PER_SIMULATION = 10_000_000  # of one simulation: a minute of the stiffest cloth; poses of more fill the memory
+MAX_SUBSTEPS_PER_SIMULATION = 10_000_000  # a minute of the stiffest cloth; poses of more fill the memory
 EXPECTED_PART_NAME = "a name without dots or a leading underscore that torch's ModuleDict has not"
 
 
@@ -33,7 +33,11 @@ def check_parts(
     boundaries: Mapping[str, AbstractBoundary],
     contact: Contact | None,
 ) -> None:
-    """What a cloth is made of, each of its kind."""
+    """Check that each part of a cloth is of its kind.
+
+    Raises:
+        InvalidInput: a part of another type, or a name that no part can have.
+    """
     _check_kind("mesh", mesh, Mesh, "a Mesh, as torchcloth.meshes makes them")
     _check_kind("material", material, AbstractMaterial, "a material, of torchcloth.materials or derived from one")
     for what, parts in (("effects", effects), ("boundaries", boundaries)):
@@ -45,13 +49,13 @@ def check_parts(
 
 
 def is_name(name: object) -> bool:
-    """Whether a part can be called so."""
+    """Return whether an effect or boundary can have this name."""
     plain = isinstance(name, str) and bool(name) and "." not in name and not name.startswith("_")
     return plain and not hasattr(nn.ModuleDict(), str(name))
 
 
 def check_part(what: str, name: object, part: object) -> None:
-    """One of the "effects" or "boundaries"."""
+    """Check the name and type of one part; ``what`` is "effects" or "boundaries"."""
     if not is_name(name):
         raise InvalidInput("name of an effect or boundary", got=repr(name), expected=EXPECTED_PART_NAME)
     kind = {"effects": AbstractEffect, "boundaries": AbstractBoundary}[what]
@@ -65,7 +69,13 @@ def _check_kind(what: str, value: object, kind: type | tuple[type, ...], expecte
 
 
 def check_field(name: str, raw: Tensor, triangles: int | None) -> None:
-    """Fields have one value per triangle, where there may be some; batches of scalars are [B, 1]."""
+    """Check the shape of a parameter: a scalar, a batch [B, 1], or one value per triangle where that is allowed.
+
+    Args:
+        name: for messages.
+        raw: the stored tensor.
+        triangles: number of triangles; None: no field is allowed.
+    """
     if raw.ndim and raw.shape[-1] not in (1, triangles):
         expected = (
             "a scalar or [B, 1]" if triangles is None else f"a scalar, [{triangles}] (one per triangle) or [B, 1]"
@@ -74,7 +84,7 @@ def check_field(name: str, raw: Tensor, triangles: int | None) -> None:
 
 
 def mesh_warnings(mesh: Mesh, density: Tensor) -> Iterator[str]:
-    """What looks like another unit, though somebody may mean it."""
+    """Yield warnings about numbers that look like another unit, and about vertices that lie on each other."""
     span, heaviest = float(np.ptp(mesh.vertices, axis=0).max()), float(density.detach().max())
     if span > MAX_CLOTH_SPAN_M:
         yield f"the mesh spans {span:.4g} m: is it in millimetres? Lengths are in metres"
@@ -88,7 +98,7 @@ def mesh_warnings(mesh: Mesh, density: Tensor) -> Iterator[str]:
 
 
 def check_axes(mesh: Mesh, parts: Mapping[str, AbstractMaterial | AbstractEffect]) -> None:
-    """Without a pattern each triangle has axes of its own."""
+    """Check that the mesh has a pattern if a part distinguishes warp and weft; else each triangle has its own axes."""
     name = next((name for name, part in parts.items() if part.has_axes), None)
     if mesh.pattern is None and name is not None:
         raise InvalidInput(
@@ -100,7 +110,7 @@ def check_axes(mesh: Mesh, parts: Mapping[str, AbstractMaterial | AbstractEffect
 
 
 def check_fields(effects: Mapping[str, AbstractEffect], triangles: int) -> None:
-    """What the parameters of effects may be, where these say so."""
+    """Check the shapes of the effects' parameters, for effects that declare which may be fields."""
     for name, effect in effects.items():
         for path, part in effect.named_modules():
             if isinstance(part, PhysicalParameter) and effect.per_triangle is not None:
@@ -108,7 +118,7 @@ def check_fields(effects: Mapping[str, AbstractEffect], triangles: int) -> None:
 
 
 def check_numbers(what: str, values: object, finite: bool = True) -> None:
-    """Refuse what is not a tensor of real numbers, and finite ones."""
+    """Check that ``values`` is a tensor of real numbers, and by default of finite ones."""
     if not isinstance(values, Tensor) or not values.is_floating_point():
         got = values.dtype if isinstance(values, Tensor) else type(values).__name__
         raise InvalidInput(what, got=str(got).removeprefix("torch."), expected="a tensor of real numbers")
@@ -117,19 +127,23 @@ def check_numbers(what: str, values: object, finite: bool = True) -> None:
 
 
 def check_duration(seconds: float) -> None:
-    """Time to settle in."""
+    """Check that the duration of settling is positive."""
     if not 0 < seconds < float("inf"):
         raise InvalidInput("duration of settling", got=f"{seconds:g} s", expected="a time > 0")
 
 
 def check_rate(rate: float) -> None:
-    """Damping while a cloth settles."""
+    """Check that the damping rate of settling is not negative."""
     if not 0 <= rate < float("inf"):
         raise InvalidInput("rate of settling", got=f"{rate:g} 1/s", expected="a finite rate >= 0")
 
 
 def check_times(times: Tensor | Sequence[float]) -> list[float]:
-    """Frame times as a list of increasing seconds."""
+    """Return frame times as a list of increasing seconds.
+
+    Raises:
+        InvalidInput: fewer than two, not increasing, not finite, or a tensor that requires gradients.
+    """
     if isinstance(times, Tensor) and times.requires_grad and torch.is_grad_enabled():
         remedy = "times.detach(); gradients by when a motion happens are those by its Trajectory.t"
         raise InvalidInput("times", got="a tensor that wants gradients", expected="frame times, fixed", remedy=remedy)
@@ -145,10 +159,10 @@ def check_times(times: Tensor | Sequence[float]) -> list[float]:
 
 
 def check_parameters(cloth: nn.Module) -> None:
-    """What an optimiser's step may have brought, or parts that were put in later.
+    """Check what an optimiser step, or a part that was added later, may have broken.
 
-    No NaN: comparisons with one are false, so a threshold of NaN would pass for an effect that is not there. And no
-    amplitude below zero, which would drive what it should brake.
+    NaN is refused: comparisons with NaN are false, so a threshold of NaN would act as an absent effect. Negative
+    amplitudes are refused: they would drive what they should brake.
     """
     effects: dict[str, AbstractEffect] = dict(cloth.effects.items())  # type: ignore[arg-type, operator, union-attr]
     check_fields(effects, len(cloth.mesh.faces))  # type: ignore[arg-type, union-attr]
@@ -159,14 +173,19 @@ def check_parameters(cloth: nn.Module) -> None:
             raise InvalidInput(name, got="NaN", expected="a number", remedy="look at the optimiser's last step")
     for name, part in cloth.named_modules():
         if isinstance(part, PhysicalParameter):
-            if name.startswith("material.") or name == "areal_density":  # others may have been put in their place
+            if name.startswith("material.") or name == "areal_density":  # a user may have replaced them
                 check_field(name, part.raw, len(cloth.mesh.faces))  # type: ignore[arg-type]
             clips = part.domain == "nonnegative"
             part.check_in_domain(name, "call the cloth's clip_() after every step of an optimiser" if clips else "")
 
 
 def check_step(dt: float | None, limit: float) -> float:
-    """The substep to use [s]: the limit, or the user's if it is no larger."""
+    """Return the substep to use [s]: the limit, or the user's ``dt`` if it is no larger.
+
+    Raises:
+        InvalidInput: ``dt`` is not a positive number.
+        UnstableStep: ``dt`` is beyond the limit.
+    """
     if dt is None:
         return limit
     if isinstance(dt, np.number | np.ndarray | Tensor) and dt.ndim == 0:
@@ -184,7 +203,13 @@ def check_step(dt: float | None, limit: float) -> float:
 
 
 def check_substeps(seconds: float, step: float, dt: float | None = None) -> None:
-    """Refuse a simulation that would never end, because of the user's ``dt`` or of a stable ``step`` [s] that tiny."""
+    """Check that a simulation has at most MAX_SUBSTEPS_PER_SIMULATION substeps.
+
+    Args:
+        seconds: simulated time [s].
+        step: substep [s].
+        dt: what the user asked for [s]; None: ``step`` is the stable one.
+    """
     count = seconds / step if step > 0 else float("inf")  # a step that overflowed is NaN
     if count <= MAX_SUBSTEPS_PER_SIMULATION:
         return
@@ -196,7 +221,7 @@ def check_substeps(seconds: float, step: float, dt: float | None = None) -> None
 
 
 def check_grasps(effects: Mapping[str, AbstractEffect], boundaries: nn.ModuleDict) -> None:
-    """An effect on a grip needs that grip."""
+    """Check that the grasp of every effect on a grip is among the boundaries."""
     grasps = [name for name, boundary in boundaries.items() if isinstance(boundary, Grasp)]
     for name, effect in effects.items():
         if effect.grasp is not None and effect.grasp not in grasps:
@@ -208,7 +233,7 @@ def check_grasps(effects: Mapping[str, AbstractEffect], boundaries: nn.ModuleDic
 
 
 def check_mapping(motion: object) -> None:
-    """Trajectories have names."""
+    """Check that ``motion`` is a mapping from boundary to trajectory."""
     if not isinstance(motion, Mapping):
         raise InvalidInput("motion", got=type(motion).__name__, expected="a dict of trajectories by boundary")
 
@@ -216,7 +241,7 @@ def check_mapping(motion: object) -> None:
 def check_motions(
     motion: Mapping[str, Trajectory], boundaries: nn.ModuleDict, frames: list[float], like: Tensor
 ) -> dict[str, Trajectory]:
-    """One usable trajectory for every driven boundary, in the precision and on the device of ``like``."""
+    """Check that every driven boundary has a valid trajectory; return them in the precision and device of ``like``."""
     driven = {name for name, boundary in boundaries.items() if boundary.is_prescribed}
     check_mapping(motion)
     if set(motion) != driven:
@@ -230,7 +255,7 @@ def check_motions(
 
 
 def as_positions(name: str, given: object, like: Tensor) -> Tensor:
-    """[..., V, 3] as the cloth's numbers are."""
+    """Return positions or velocities [..., V, 3] as a tensor of the type and device of ``like``."""
     try:
         return torch.as_tensor(given, dtype=like.dtype, device=like.device)  # type: ignore[arg-type]
     except (TypeError, ValueError, RuntimeError) as error:
@@ -239,7 +264,7 @@ def as_positions(name: str, given: object, like: Tensor) -> Tensor:
 
 
 def check_positions(x: Tensor, v: Tensor, vertices: int) -> None:
-    """Refuse positions [..., V, 3] and velocities for another number of vertices, or not finite."""
+    """Check that positions and velocities [..., V, 3] are finite, and are of ``vertices`` vertices."""
     if x.shape[-2:] != (vertices, 3) or not x.numel():
         raise InvalidInput("x", got=f"shape {tuple(x.shape)}", expected=f"[..., {vertices}, 3] in metres")
     if v.shape != x.shape:
@@ -250,53 +275,61 @@ def check_positions(x: Tensor, v: Tensor, vertices: int) -> None:
 
 
 def check_state(state: ClothState, like: ClothState, finite: bool = True) -> None:
-    """Refuse a state that was made for another cloth (than ``like``, one of the right shapes), or is not finite."""
+    """Check that a state has the names, shapes and types of ``like``, and by default that it is finite.
+
+    Raises:
+        InvalidInput: a state of another cloth, or numbers that are not finite.
+    """
     remedy = "make states with this cloth's rest_state() or state()"
     if not isinstance(state, ClothState):
         raise InvalidInput("state", got=type(state).__name__, expected="a ClothState", remedy=remedy)
-    for name, field in _named(state).items():
+    for name, field in _state_tensors(state).items():
         check_numbers(f"state.{name}", field, finite)
         if field.dtype != like.x.dtype or field.device != like.x.device:
             got, expected = (f"{t.dtype} on {t.device}".removeprefix("torch.") for t in (field, like.x))
             raise InvalidInput(f"state.{name}", got=got, expected=f"{expected}, as the cloth's", remedy=remedy)
-    got, expected = ({name: tuple(t.shape[-2:]) for name, t in _named(s).items()} for s in (state, like))
+    got, expected = ({name: tuple(t.shape[-2:]) for name, t in _state_tensors(s).items()} for s in (state, like))
     if got != expected:
         raise InvalidInput("state", got=f"{got}", expected=f"{expected}", remedy=remedy)
 
 
-def _named(state: ClothState) -> dict[str, Tensor]:
+def _state_tensors(state: ClothState) -> dict[str, Tensor]:
     return {"x": state.x, "v": state.v, "d3": state.d3, **state.memory}
 
 
 def expand_state(state: ClothState, model: Model, motion: Mapping[str, Trajectory]) -> ClothState:
-    """The state with the batch dimensions of parameters and motion, so that one state serves many of them.
+    """Expand the state to the batch dimensions of parameters and motion, so that one state serves a whole batch.
 
     Raises:
-        InvalidInput: batch dimensions that do not go together, or none is left.
+        InvalidInput: batch dimensions that do not broadcast, or an empty batch.
     """
     tensors: list[Tensor] = []
     coefficients = (model.coefficients, model.areal_density, model.mass, *(c for _, c in model.effects.values()))
     tree_map(coefficients, lambda t: tensors.append(t) or t)
-    found = {
-        **{f"state.{name}": field.shape[:-2] for name, field in _named(state).items()},
+    batches = {
+        **{f"state.{name}": field.shape[:-2] for name, field in _state_tensors(state).items()},
         **{f"motion[{name!r}].pose": trajectory.pose.shape[:-3] for name, trajectory in motion.items()},
     }
     parameters = [t.shape[:-2] for t in tensors if t.ndim > 2]
-    own = (p for b in model.boundaries.values() for p in b.modules() if isinstance(p, PhysicalParameter))
-    parameters += [p.raw.shape[:-1] for p in own if p.raw.ndim]
+    of_boundaries = (p for b in model.boundaries.values() for p in b.modules() if isinstance(p, PhysicalParameter))
+    parameters += [p.raw.shape[:-1] for p in of_boundaries if p.raw.ndim]
     try:
-        batch = torch.broadcast_shapes(*found.values(), *parameters)
+        batch = torch.broadcast_shapes(*batches.values(), *parameters)
     except RuntimeError:
         batch = None
     if batch is None or batch.numel() == 0:
-        several = {name: tuple(shape) for name, shape in found.items() if shape}
-        got = f"{several}, parameters {sorted({tuple(shape) for shape in parameters})}"
+        nonempty = {name: tuple(shape) for name, shape in batches.items() if shape}
+        got = f"{nonempty}, parameters {sorted({tuple(shape) for shape in parameters})}"
         raise InvalidInput("batch dimensions", got=got, expected="shapes that broadcast, to at least one scene")
     return state.map(lambda field: field.expand(*batch, *field.shape[-2:]))
 
 
 def check_extent(x: Tensor, limit: float) -> None:
-    """A cloth wider than the contact grid would touch its own copies."""
+    """Check that the cloth fits into the contact grid, where a wider one would touch its own images.
+
+    Raises:
+        SimulationDiverged: an extent [m] beyond ``limit``.
+    """
     x = x.detach()
     extent = float((x.amax(-2) - x.amin(-2)).max())
     if extent > limit:

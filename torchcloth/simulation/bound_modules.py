@@ -19,7 +19,10 @@ from .argument_checks import check_axes, check_fields, check_part
 
 
 class BoundModuleDict(nn.ModuleDict):
-    """By name. What is put in, also later, is bound to the mesh and takes the precision and device of the others."""
+    """Parts of a cloth by name, each bound to the cloth's mesh.
+
+    A part that is added later is bound as well, and takes the precision and device of the others.
+    """
 
     _like: torch.Tensor
 
@@ -38,7 +41,7 @@ class BoundModuleDict(nn.ModuleDict):
         _OWNERS[module] = (*_owners(module), ref(self))
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        """A copy owns its parts, too, if these were copied as well."""
+        """Restore a copy, which owns its parts too if these were copied with it."""
         super().__setstate__(state)
         for part in self.values():
             if not _owners(part):
@@ -46,9 +49,13 @@ class BoundModuleDict(nn.ModuleDict):
 
 
 def check_not_bound_elsewhere(mesh: Mesh, parts: Iterable[tuple[str, AbstractEffect | AbstractBoundary]]) -> None:
-    """Refuse what is bound to another cloth's mesh: it would be bound anew under that one's feet."""
+    """Refuse parts that are bound to the mesh of another cloth, which binding them anew would break.
+
+    Raises:
+        InvalidInput: a part of a cloth with another mesh.
+    """
     for name, part in parts:
-        if any((owner := known()) is not None and not owner._mesh.is_equal(mesh) for known in _owners(part)):
+        if any((owner := reference()) is not None and not owner._mesh.is_equal(mesh) for reference in _owners(part)):
             raise InvalidInput(
                 name,
                 got="an effect or boundary of another cloth, bound to its mesh",
@@ -67,7 +74,10 @@ class UnboundParts(NamedTuple):
 
 
 def copy_parts(cloth: Any) -> UnboundParts:
-    """What another cloth may be built from, on any mesh; what they share among them they share still."""
+    """Copy the parts of a cloth, to build another cloth from them on any mesh.
+
+    Modules that several parts share are shared by their copies too.
+    """
     memo = {id(cloth.mesh): cloth.mesh}
     effects, boundaries = (
         {name: copy.deepcopy(part, memo) for name, part in parts.items()} for parts in (cloth.effects, cloth.boundaries)
@@ -77,7 +87,6 @@ def copy_parts(cloth: Any) -> UnboundParts:
 
 
 def _owners(part: nn.Module) -> tuple[ref[BoundModuleDict], ...]:
-    """Those that live."""
     return tuple(owner for owner in _OWNERS.get(part, ()) if owner() is not None)
 
 
