@@ -13,7 +13,7 @@ import shutil
 import sys
 from pathlib import Path
 
-from setuptools import setup
+from setuptools import Distribution, setup
 from setuptools.command.bdist_wheel import bdist_wheel
 from setuptools.command.build_py import build_py
 
@@ -50,13 +50,16 @@ class BuildWithEngine(build_py):
             print(f"torchcloth: the engine is not built now: {miss}", file=sys.stderr)
 
 
-class WheelForOnePlatform(bdist_wheel):
-    """A wheel with portable libraries: for every Python 3, since these know nothing of Python, on one platform."""
+class DistributionWithEngine(Distribution):
+    """Portable libraries count as compiled modules, so that the wheel is for one platform."""
 
-    def finalize_options(self):
-        """Mark the wheel as one for this platform."""
-        super().finalize_options()
-        self.root_is_pure = self.root_is_pure and PREBUILD != "portable"
+    def has_ext_modules(self):
+        """Return whether there are compiled modules."""
+        return PREBUILD == "portable" or super().has_ext_modules()
+
+
+class WheelForEveryPython(bdist_wheel):
+    """The libraries know nothing of Python: one wheel serves all versions of Python 3 on a platform."""
 
     def get_tag(self):
         """Return the tag, e.g. py3-none-linux_x86_64."""
@@ -64,4 +67,4 @@ class WheelForOnePlatform(bdist_wheel):
         return ("py3", "none", platform) if PREBUILD == "portable" else (python, abi, platform)
 
 
-setup(cmdclass={"build_py": BuildWithEngine, "bdist_wheel": WheelForOnePlatform})
+setup(distclass=DistributionWithEngine, cmdclass={"build_py": BuildWithEngine, "bdist_wheel": WheelForEveryPython})

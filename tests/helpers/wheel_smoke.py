@@ -24,7 +24,7 @@ with tempfile.TemporaryDirectory() as empty:
         results[engine] = out.x.detach(), cloth.material.youngs_modulus.raw.grad.clone()
     fall = results["fused"][0][-1, :, 2].mean().item()
     print(f"fell by {1e3 * fall:.3f} mm in 0.05 s")
-    assert abs(fall + 0.5 * 9.81 * 0.05**2) < 2e-4, fall
+    assert abs(fall / (-0.5 * 9.81 * 0.05**2) - 1) < 0.1, fall  # symplectic Euler with steps of 3 ms
     for fused, reference in zip(results["fused"], results["reference"], strict=True):
         torch.testing.assert_close(fused, reference, rtol=1e-8, atol=1e-10)
     print("ok")
