@@ -1,4 +1,4 @@
-"""Studies on disk: finished cases are files, so that a study can be stopped at any time, continued and extended."""
+"""Resumable studies: each finished case is a file, so that a study can be stopped at any time, resumed and extended."""
 
 from __future__ import annotations
 
@@ -17,33 +17,41 @@ from torchcloth._utils.resume import source_fingerprint
 from torchcloth.errors import InvalidInput, RecordingError, TorchclothError
 
 Case = Callable[[], dict[str, Any]]
+SETTINGS_FILE = "study.json"
 
 
-class Kept:
-    """A folder of finished cases, one JSON file each; nothing is written before ``begin``, or the first is finished.
+class ResumableStudy:
+    """A folder of finished cases, one JSON file for each.
+
+    Nothing is written before ``start`` or before the first case is finished.
 
     Args:
-        folder: new, or one that holds a study of the same settings.
-        settings: what all cases depend on, besides the library's code; plain JSON.
+        folder: new, or a folder of a study with the same settings.
+        settings: plain JSON, all that the cases depend on besides the code.
 
     Raises:
-        InvalidInput: the folder holds a study of other settings or by other code, or is a file.
+        InvalidInput: the folder is a file, or contains a study with other settings or by other code.
     """
 
     def __init__(self, folder: Path, settings: Mapping[str, Any]) -> None:
         self.folder, self.settings = folder, dict(settings)
-        check_settings(folder, self.settings)
+        _check_settings(folder, self.settings)
 
-    def begin(self) -> None:
-        """Note the settings at once: where cases leave more than a result, also of a study stopped in its first one."""
-        if not (self.folder / "study.json").exists():
-            write_settings(self.folder, self.settings)
+    def start(self) -> None:
+        """Write the settings, if they are not there yet.
 
-    def find(self, name: str) -> dict[str, Any] | None:
-        """A finished case, or None.
+        Needed at once by studies whose cases leave more than a result, in case the first one is interrupted.
+        """
+        if not (self.folder / SETTINGS_FILE).exists():
+            self.folder.mkdir(parents=True, exist_ok=True)
+            text = json.dumps(_with_fingerprint(self.settings), indent=1) + "\n"
+            write_text(self.folder / SETTINGS_FILE, text)
+
+    def load_case(self, name: str) -> dict[str, Any] | None:
+        """Return a finished case, or None.
 
         Raises:
-            RecordingError: its file is damaged.
+            RecordingError: the file is damaged.
         """
         path = self._path(name)
         try:
@@ -51,40 +59,44 @@ class Kept:
         except FileNotFoundError:
             return None
         except ValueError:
-            raise unreadable(path) from None
+            raise damaged_file_error(path) from None
 
-    def keep(self, name: str, content: Mapping[str, Any]) -> None:
-        """Write a finished case, with null for what is not a number; a crash leaves no half file."""
-        self.begin()
+    def save_case(self, name: str, content: Mapping[str, Any]) -> None:
+        """Write a finished case atomically, with null for numbers that are not finite."""
+        self.start()
         self._path(name).parent.mkdir(exist_ok=True)
         write_text(self._path(name), to_json(content))
 
     def run(self, cases: Mapping[str, Case], jobs: int = 1) -> dict[str, dict[str, Any]]:
-        """All cases by name, the missing ones computed in turn, ``jobs`` at a time, with progress."""
-        missing = [name for name in cases if self.find(name) is None]
+        """Return all cases by name; compute the missing ones, ``jobs`` at a time, and show the progress."""
+        missing = [name for name in cases if self.load_case(name) is None]
         if missing:
             self._compute({name: cases[name] for name in missing}, len(cases), jobs)
-        return {name: found for name in cases if (found := self.find(name)) is not None}
+        return {name: case for name in cases if (case := self.load_case(name)) is not None}
 
     def _compute(self, cases: Mapping[str, Case], total: int, jobs: int) -> None:
         from rich.progress import MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
         columns = (MofNCompleteColumn(), TimeElapsedColumn(), TimeRemainingColumn(), TextColumn("{task.description}"))
-        begun, terminal = time.monotonic(), sys.stdout.isatty()
-        with Progress(*columns, refresh_per_second=2, disable=not terminal) as bar:
-            shown = bar.add_task("", total=total, completed=total - len(cases))
-            for done, name in enumerate(self._finished(cases, jobs, lambda n: bar.update(shown, description=n)), 1):
-                bar.advance(shown)
-                if not terminal:  # a log file gets lines, not a bar
-                    left = (time.monotonic() - begun) / done * (len(cases) - done) / 60
-                    print(f"{total - len(cases) + done}/{total} {name}, about {left:.1f} min left", flush=True)
+        started, is_terminal = time.monotonic(), sys.stdout.isatty()
+        with Progress(*columns, refresh_per_second=2, disable=not is_terminal) as bar:
+            task = bar.add_task("", total=total, completed=total - len(cases))
+            names = self._compute_and_save(cases, jobs, lambda name: bar.update(task, description=name))
+            for done, name in enumerate(names, 1):
+                bar.advance(task)
+                if not is_terminal:  # a log file gets lines instead of a bar
+                    minutes_left = (time.monotonic() - started) / done * (len(cases) - done) / 60
+                    count = total - len(cases) + done
+                    print(f"{count}/{total} {name}, about {minutes_left:.1f} min left", flush=True)
 
-    def _finished(self, cases: Mapping[str, Case], jobs: int, begins: Callable[[str], object]) -> Iterator[str]:
-        """Names of cases as they are kept."""
+    def _compute_and_save(
+        self, cases: Mapping[str, Case], jobs: int, on_start: Callable[[str], object]
+    ) -> Iterator[str]:
+        """Yield the names of cases as they are saved."""
 
         def work(name: str) -> str:
-            begins(name)
-            self.keep(name, cases[name]())
+            on_start(name)
+            self.save_case(name, cases[name]())
             return name
 
         if jobs == 1:
@@ -94,22 +106,25 @@ class Kept:
         try:
             yield from (done.result() for done in as_completed([pool.submit(work, name) for name in cases]))
         finally:
-            pool.shutdown(cancel_futures=True)  # when stopped, what has begun ends and nothing else begins
+            pool.shutdown(cancel_futures=True)  # after a stop, running cases end and no other case starts
 
     def _path(self, name: str) -> Path:
         return self.folder / "cases" / f"{name}.json"
 
 
-def guarded(name: str, what: str, work: Callable[[], object]) -> int:
-    """Do a study's work in one thread and float64; the command's exit code, errors said in one line.
+def run_study_command(name: str, stored: str, work: Callable[[], object]) -> int:
+    """Run a study in one thread and float64, and print errors in one line.
 
     Args:
         name: of the command.
-        what: it keeps when it is stopped, e.g. "finished cases".
-        work: to be done.
+        stored: what remains after a stop, e.g. "finished cases".
+        work: the study.
+
+    Returns:
+        Exit code: 0 done, 2 wrong input, 130 interrupted.
     """
     torch.set_default_dtype(torch.float64)
-    torch.set_num_threads(1)  # meshes of a thousand triangles: a second thread costs more than it gives
+    torch.set_num_threads(1)  # on meshes of a thousand triangles a second thread costs more than it gains
     try:
         work()
         return 0
@@ -117,52 +132,54 @@ def guarded(name: str, what: str, work: Callable[[], object]) -> int:
         print(f"{name}: {error}", file=sys.stderr)
         return 2
     except KeyboardInterrupt:
-        print(f"{name}: stopped; the same command continues, {what} are kept", file=sys.stderr)
+        print(f"{name}: stopped; the same command continues, {stored} remain", file=sys.stderr)
         return 130
 
 
+def write_result(path: Path, study: str, result: Mapping[str, Any]) -> Path:
+    """Write the result of a study as JSON with its ``schema``; numbers that are not finite become null."""
+    return write_text(path, to_json({"schema": f"torchcloth.study.{study}/1", **result}))
+
+
 def check_jobs(jobs: int) -> None:
-    """Raises InvalidInput for cases at a time that are none."""
+    """Check the option ``--jobs``.
+
+    Raises:
+        InvalidInput: the number is below 1.
+    """
     if jobs < 1:
         raise InvalidInput("--jobs", got=jobs, expected="1 or more")
 
 
-def check_settings(folder: Path, settings: Mapping[str, Any]) -> None:
-    """Raises InvalidInput where the folder cannot hold a study of these settings, or has one by other code."""
+def damaged_file_error(path: Path) -> RecordingError:
+    """Return the error for a damaged file of a study."""
+    return RecordingError(f"{path}: unreadable", remedy="delete it; it is made again")
+
+
+def _check_settings(folder: Path, settings: Mapping[str, Any]) -> None:
     check_output_folder(folder)
     try:
-        found = json.loads((folder / "study.json").read_text())
+        stored = json.loads((folder / SETTINGS_FILE).read_text())
     except FileNotFoundError:
         return
     except ValueError:
-        raise unreadable(folder / "study.json") from None
-    if not isinstance(found, dict):
-        raise unreadable(folder / "study.json")
+        raise damaged_file_error(folder / SETTINGS_FILE) from None
+    if not isinstance(stored, dict):
+        raise damaged_file_error(folder / SETTINGS_FILE)
     remedy = "use the same settings, or another folder"
-    if settings and not found.keys() & settings.keys():
+    if settings and not stored.keys() & settings.keys():
         raise InvalidInput("--out", got=f"{folder}, which holds another study", expected="a folder", remedy=remedy)
-    wanted = _of_this_code(settings)
-    other = {key: found.get(key) for key in wanted if found.get(key) != wanted[key]}
-    if not other:
+    wanted = _with_fingerprint(settings)
+    differences = {key: stored.get(key) for key in wanted if stored.get(key) != wanted[key]}
+    if not differences:
         return
-    holds = ", ".join(f"{key} {value}" if key in found else f"no {key}" for key, value in other.items())
-    expected = ", ".join(f"{key} {wanted[key]}" for key in other)
-    raise InvalidInput("--out", got=f"{folder}, which holds a study with {holds}", expected=expected, remedy=remedy)
+    got = ", ".join(f"{key} {value}" if key in stored else f"no {key}" for key, value in differences.items())
+    expected = ", ".join(f"{key} {wanted[key]}" for key in differences)
+    raise InvalidInput("--out", got=f"{folder}, which holds a study with {got}", expected=expected, remedy=remedy)
 
 
-def write_settings(folder: Path, settings: Mapping[str, Any]) -> None:
-    """Make the folder and note the settings."""
-    folder.mkdir(parents=True, exist_ok=True)
-    write_text(folder / "study.json", json.dumps(_of_this_code(settings), indent=1) + "\n")
-
-
-def _of_this_code(settings: Mapping[str, Any]) -> dict[str, Any]:
-    """With a fingerprint of the code that makes data and studies them: results of two versions are no study."""
-    here = Path(__file__).resolve().parent
-    code = source_fingerprint(here)
-    return json.loads(json.dumps({**settings, "code": code}))  # as they are read again: a tuple is a list
-
-
-def unreadable(path: Path) -> RecordingError:
-    """The error for a damaged file of a study."""
-    return RecordingError(f"{path}: unreadable", remedy="delete it; it is made again")
+def _with_fingerprint(settings: Mapping[str, Any]) -> dict[str, Any]:
+    """Add a fingerprint of the code that generates and studies the data, because two versions make no common study."""
+    code = source_fingerprint(Path(__file__).resolve().parent)
+    content = {"schema": "torchcloth.study/1", **settings, "code": code}
+    return json.loads(json.dumps(content))  # as they are read again: a tuple becomes a list

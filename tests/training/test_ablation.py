@@ -10,10 +10,9 @@ import torch
 
 from torchcloth.errors import InvalidInput
 from torchcloth.materials import AEP
-from torchcloth.training.ablation import command
-from torchcloth.training.ablation import runs as studies
+from torchcloth.training.ablation import command, runs
 from torchcloth.training.ablation.measures import (
-    energies,
+    energies_without_each,
     scaled_poisson,
 )
 from torchcloth.training.ablation.scenes import (
@@ -21,9 +20,9 @@ from torchcloth.training.ablation.scenes import (
     GARMENTS,
     LEVELS,
     PARAMETERS,
+    PERTURBATION_STD_M,
     PERTURBED,
     REFERENCE,
-    TRIFLE,
     Scene,
     Setup,
     Variant,
@@ -41,7 +40,7 @@ def test_scenes_start_unstrained_above_the_table(garment, action):
     assert scene.start[:, 2].min() >= 0
     cloth = scene.cloth([REFERENCE])
     with torch.no_grad():
-        membrane = float(energies(cloth.build_model(), cloth.rest_state())["total"])
+        membrane = float(energies_without_each(cloth.build_model(), cloth.rest_state())["total"])
     weight = 9.81 * COARSE.areal_density * scene.mesh.area.sum()
     assert membrane < 1e-4 * weight * scene.mesh.mean_edge, "nothing springs up at the start"
     for name, at in scene.action.motion.items():
@@ -54,7 +53,7 @@ def test_scenes_start_unstrained_above_the_table(garment, action):
 def test_one_step_serves_all_variants():
     scene = Scene(COARSE, "shirt", "drag")
     variants = [Variant(p, level) for p in PARAMETERS for level in LEVELS]
-    assert scene.step() <= scene.cloth(variants).stable_step() * (1 + 1e-12)
+    assert scene.stable_step_of_all() <= scene.cloth(variants).stable_step() * (1 + 1e-12)
 
 
 def test_variants_scale_one_parameter_each():
@@ -74,14 +73,14 @@ def test_variants_scale_one_parameter_each():
 
 def test_a_batch_is_what_its_runs_are_alone(monkeypatch):
     scene = Scene(COARSE, "shirt", "drag")
-    monkeypatch.setattr(scene, "frames", lambda: [0.0, 0.02, 0.04])
+    monkeypatch.setattr(scene, "frame_times", lambda: [0.0, 0.02, 0.04])
     together = list(scene.simulate([REFERENCE, PERTURBED, Variant("E", 25)]))[-1][1]
     alone = list(scene.simulate([Variant("E", 25)]))[-1][1][0]
     np.testing.assert_allclose(together[2].x, alone.x, atol=1e-6)
     np.testing.assert_allclose(together[2].energy["total"], alone.energy["total"], rtol=1e-6, atol=1e-12)
     start = together[1].x[0] - together[0].x[0]
-    assert 0.5 * TRIFLE < start.std() < 2 * TRIFLE
-    assert np.abs(together[2].x[-1] - together[0].x[-1]).max() > 10 * TRIFLE
+    assert 0.5 * PERTURBATION_STD_M < start.std() < 2 * PERTURBATION_STD_M
+    assert np.abs(together[2].x[-1] - together[0].x[-1]).max() > 10 * PERTURBATION_STD_M
 
 
 # -- the command ----------------------------------------------------------------------------------------------------
@@ -197,8 +196,8 @@ def test_a_folder_with_other_settings_is_refused(finished, tmp_path, capsys):
 
 
 def test_a_damaged_run_is_named(finished, tmp_path, capsys):
-    runs = studies.Study(tmp_path, Setup(triangles=60, pace=8.0))
-    runs.begin()
+    study = runs.AblationStudy(tmp_path, Setup(triangles=60, pace=8.0))
+    study.start()
     (tmp_path / "runs" / "dress-drag-reference.npz").write_bytes(b"half")
     assert call(tmp_path, "--report") == 2
     assert "dress-drag-reference.npz: unreadable" in capsys.readouterr().err
@@ -243,7 +242,7 @@ def test_a_process_that_the_system_ends_is_one_line(monkeypatch, tmp_path):
         def shutdown(self, **_):
             pass
 
-    monkeypatch.setattr(studies, "ProcessPoolExecutor", Pool)
-    kept = studies.Study(tmp_path / "s", Setup())
+    monkeypatch.setattr(runs, "ProcessPoolExecutor", Pool)
+    study = runs.AblationStudy(tmp_path / "s", Setup())
     with pytest.raises(InvalidInput, match="--jobs; got 2, and the system ended one of them"):
-        studies.simulate(kept, [studies.Task(("shirt", "drag"), [])], 2, lambda *_: None)
+        runs.simulate_batches(study, [runs.Batch(("shirt", "drag"), [])], 2, lambda *_: None)

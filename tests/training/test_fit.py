@@ -20,10 +20,14 @@ import torchcloth.training.fit.run as run
 from torchcloth import recordings as rec
 from torchcloth.training.fit.command import main
 from torchcloth.training.fit.config import Learn, Network, load
-from torchcloth.training.fit.learned_cloth import Learned
+from torchcloth.training.fit.learned_cloth import LearnedCloth
 from torchcloth.training.fit.module import FitModule
 
-NETWORK = {"module": "helpers.user_networks.Small", "gives": ["youngs_modulus"], "arguments": {"width": 3, "drop": 0.3}}
+NETWORK = {
+    "module": "helpers.user_networks.Small",
+    "outputs": ["youngs_modulus"],
+    "arguments": {"width": 3, "drop": 0.3},
+}
 EVERYTHING = {"parameters": ["air.normal"], "fields": ["areal_density"], "network": NETWORK, "roughness": 0.1}
 
 
@@ -44,10 +48,10 @@ class Stop(Callback):
 
 def stop_at(monkeypatch, step):
     """The next runs end in step ``step``."""
-    whole = run._trainer
+    content_bytes = run._trainer
 
     def trainer(*args):
-        made = whole(*args)
+        made = content_bytes(*args)
         made.callbacks.append(Stop(step))
         return made
 
@@ -56,8 +60,8 @@ def stop_at(monkeypatch, step):
 
 def state(folder):
     """Weights, optimiser, schedule and history of the last checkpoint."""
-    found = torch.load(folder / "last.ckpt", weights_only=True)
-    return [found[key] for key in ("state_dict", "optimizer_states", "lr_schedulers", "history")]
+    content = torch.load(folder / "last.ckpt", weights_only=True)
+    return [content[key] for key in ("state_dict", "optimizer_states", "lr_schedulers", "history")]
 
 
 def same(one, two):
@@ -75,25 +79,25 @@ def test_it_learns_the_fabric(config, tmp_path):
     """The points lie on the true sheet: E goes from 80 kPa towards 40, and loads back without the data."""
     path = config(learn={"parameters": ["youngs_modulus"]}, optimizer={"rate": 0.15, "steps": 20, "half_life": 6})
     assert main(["--config", path]) == 0
-    found = json.loads((tmp_path / "out" / "fit.json").read_text())
-    own = found["parameters"]["youngs_modulus"]
-    assert (own["initial"], own["unit"]) == (pytest.approx(8e4), "Pa")
-    assert own["value"] == pytest.approx(4e4, rel=0.05)
-    assert found["train"]["loss_after"] < 0.05 * found["train"]["loss_before"]
-    assert "not with error bars" in found["remark"]
-    assert f"youngs_modulus={own['value']:.6g}" in found["identify"]
-    assert [entry["step"] for entry in found["history"]] == list(range(20))
+    content = json.loads((tmp_path / "out" / "fit.json").read_text())
+    entry = content["parameters"]["youngs_modulus"]
+    assert (entry["initial"], entry["unit"]) == (pytest.approx(8e4), "Pa")
+    assert entry["value"] == pytest.approx(4e4, rel=0.05)
+    assert content["train"]["loss_after"] < 0.05 * content["train"]["loss_before"]
+    assert "without error bars" in content["remark"]
+    assert f"youngs_modulus={entry['value']:.6g}" in content["identify_command"]
+    assert [entry["step"] for entry in content["history"]] == list(range(20))
     cloth = FitModule.load_from_checkpoint(tmp_path / "out" / "last.ckpt").cloth()
-    assert float(cloth.material.youngs_modulus.value) == own["value"]
+    assert float(cloth.material.youngs_modulus.value) == entry["value"]
 
 
-def test_what_was_before_is_told_of_all_episodes_or_not_at_all(config, episodes, tmp_path):
+def test_figures_before_are_of_all_episodes_or_missing(config, episodes, tmp_path):
     """The first step of a part of them told of that part, beside the end's of all."""
     data = {"train": str(episodes / "ep_*")}
-    for per_step, told in ((0, True), (2, False)):
+    for per_step, has_loss_before in ((0, True), (2, False)):
         out = tmp_path / f"of-{per_step}"
         assert main(["--config", config(data={**data, "per_step": per_step}), f"out={out}"]) == 0
-        assert ("loss_before" in json.loads((out / "fit.json").read_text())["train"]) == told
+        assert ("loss_before" in json.loads((out / "fit.json").read_text())["train"]) == has_loss_before
 
 
 @pytest.mark.parametrize("step", [1, 3])  # in the midst of a shuffle, and at the beginning of one
@@ -101,7 +105,7 @@ def test_resuming_is_bit_for_bit(config, episodes, tmp_path, monkeypatch, step):
     """Stopped within any step: shuffled episodes, dropout, schedule, a scalar, a field and a network."""
     data = {"train": str(episodes / "ep_*"), "per_step": 2}
     path = config(learn=EVERYTHING, optimizer={"steps": 4, "half_life": 3}, data=data)
-    whole = run.fit(load(path, [f"out={tmp_path / 'whole'}"]))
+    content_bytes = run.fit(load(path, [f"out={tmp_path / 'whole'}"]))
     with monkeypatch.context() as patch:
         stop_at(patch, step)
         with pytest.raises(Stopped):
@@ -109,13 +113,16 @@ def test_resuming_is_bit_for_bit(config, episodes, tmp_path, monkeypatch, step):
     assert len(torch.load(tmp_path / "out" / "last.ckpt", weights_only=True)["history"]) == step
     resumed = run.fit(load(path), resume=True)
     assert same(state(tmp_path / "whole"), state(tmp_path / "out"))
-    assert same(whole.learned.values(), resumed.learned.values())
-    assert not torch.equal(whole.learned.values()["areal_density"], torch.full((32,), 0.3))
+    assert same(content_bytes.learned.values(), resumed.learned.values())
+    assert not torch.equal(content_bytes.learned.values()["areal_density"], torch.full((32,), 0.3))
 
 
 def test_a_gradient_that_is_no_number_is_not_followed(config, tmp_path, capsys):
     """The checkpoint is from the step before, and can be gone on from."""
-    path = config(learn={"network": {"module": "helpers.user_networks.Spoilt", "gives": ["youngs_modulus"]}}, optimizer={"steps": 4})
+    path = config(
+        learn={"network": {"module": "helpers.user_networks.Spoilt", "outputs": ["youngs_modulus"]}},
+        optimizer={"steps": 4},
+    )
     for again in ([], ["--resume"]):
         assert main(["--config", path, *again]) == 2
         assert "gradient of step 2; got numbers that are not finite" in capsys.readouterr().err
@@ -184,7 +191,7 @@ def test_slurm_leaves_resuming_to_the_user(config, tmp_path, monkeypatch):
     assert len(json.loads((tmp_path / "out" / "fit.json").read_text())["history"]) == 2
 
 
-def test_what_is_doubtful_is_told(config, episodes, tmp_path, capsys):
+def test_warnings_of_episodes_are_reported(config, episodes, tmp_path, capsys):
     seen = rec.read(episodes / "ep_0")
     open_ = {name: replace(hand, closed=np.zeros_like(hand.closed)) for name, hand in seen.grippers.items()}
     rec.write(replace(seen, grippers=open_), tmp_path / "open")
@@ -225,7 +232,9 @@ def test_a_network_loads_back(config, tmp_path):
     assert cloth.material.youngs_modulus.value.shape == (32,)
     assert cloth.stable_step() > 0
     assert (tmp_path / "out" / "fields.npz").is_file()
-    assert json.loads((tmp_path / "out" / "fit.json").read_text())["identify"] is None  # no number to start from
+    assert (
+        json.loads((tmp_path / "out" / "fit.json").read_text())["identify_command"] is None
+    )  # no number to start from
 
 
 def test_validation_is_held_out(config, episodes, tmp_path):
@@ -250,7 +259,7 @@ def test_a_network_cannot_make_a_cone_negative():
     mesh = tc.meshes.rectangle(0.2, 0.2, triangles=18)
     cloth = tc.Cloth(mesh, tc.materials.AEP.preset("cotton"), 0.15, contact=tc.Contact(0.05))
     network = Network("torch.nn.Linear", ["cone"], {"in_features": 2, "out_features": 1})
-    learned = Learned(cloth, Learn(network=network))
+    learned = LearnedCloth(cloth, Learn(network=network))
     with torch.no_grad():
         learned.network.weight.zero_()
         learned.network.bias.fill_(-1.0)
@@ -260,21 +269,21 @@ def test_a_network_cannot_make_a_cone_negative():
 def test_what_is_left_is_no_validation(config, episodes, tmp_path):
     """A log of validation ends with the last step's; the training set's figures stood there."""
     data = {"train": [str(episodes / "ep_0")], "val": [str(episodes / "ep_1")]}
-    for name, own in (("with", data), ("without", {**data, "val": []})):
-        path = config(data=own, optimizer={"steps": 2}, run={"loggers": ["csv"]})
+    for name, entry in (("with", data), ("without", {**data, "val": []})):
+        path = config(data=entry, optimizer={"steps": 2}, run={"loggers": ["csv"]})
         assert main(["--config", path, f"out={tmp_path / name}"]) == 0
         (log,) = (tmp_path / name).rglob("metrics.csv")
         with log.open() as file:
             seen = [row["val/loss"] for row in csv.DictReader(file) if row.get("val/loss")]
-        assert len(seen) == (2 if own["val"] else 0)
-        found = json.loads((tmp_path / name / "fit.json").read_text())
-        assert found["train"]["loss_after"] > 0
+        assert len(seen) == (2 if entry["val"] else 0)
+        content = json.loads((tmp_path / name / "fit.json").read_text())
+        assert content["train"]["loss_after"] > 0
 
 
 def test_the_command_for_errors_takes_the_same_steps(config, tmp_path):
     path = config(learn={"parameters": ["youngs_modulus"]}, optimizer={"steps": 1}, model={"dt": 2e-4})
     assert main(["--config", path]) == 0
-    assert json.loads((tmp_path / "out" / "fit.json").read_text())["identify"].endswith("--dt 0.0002")
+    assert json.loads((tmp_path / "out" / "fit.json").read_text())["identify_command"].endswith("--dt 0.0002")
 
 
 def test_globs_find_folders(config, episodes, tmp_path):
@@ -289,6 +298,6 @@ def test_a_stopped_run_promises_only_its_own_checkpoint(config, monkeypatch, cap
     assert main(["--config", path]) == 0
     stopped = lambda *_: (_ for _ in ()).throw(KeyboardInterrupt)  # noqa: E731
     monkeypatch.setattr(run, "fit", stopped)
-    for options, promised in ((["--resume"], True), (["optimizer.rate=0.2"], False)):
+    for options, promised in ((["--resume"], True), (["optimizer.learning_rate=0.2"], False)):
         assert main(["--config", path, *options]) == 130
         assert ("goes on after" in capsys.readouterr().err) == promised

@@ -11,7 +11,7 @@ pytest.importorskip("lightning")
 from torchcloth import recordings as rec
 from torchcloth.training.fit.command import main
 from torchcloth.training.fit.config import load
-from torchcloth.training.fit.data import Deal
+from torchcloth.training.fit.data import ShuffledEpisodeSampler
 
 PAIR = "{in1_features: 2, in2_features: 2, out_features: 1}"
 SEVEN, TWO = "{in_features: 7, out_features: 1}", "{input_size: 2, hidden_size: 1}"
@@ -21,12 +21,18 @@ LESS = "{in_features: -2, out_features: 1}"
 @pytest.mark.parametrize(
     ("options", "words"),
     [
-        (["optimizer.stepz=3"], "config: optimizer.stepz; got an unknown key; expected one of rate, steps, half_life"),
+        (
+            ["optimizer.stepz=3"],
+            "config: optimizer.stepz; got an unknown key; expected one of learning_rate, steps, half_life",
+        ),
         (["optimiser.steps=3"], "config: optimiser; got an unknown key"),
         (["optimizer.steps=many"], "config: optimizer.steps; got 'many'; expected a whole number"),
         (["optimizer.steps=0"], "config: optimizer.steps; got 0; expected at least 1"),
-        (["optimizer.rate=-1"], "config: optimizer.rate; got -1.0"),
-        (["optimizer.rate=.inf"], "config: optimizer.rate; got inf; expected more than 0, and finite"),
+        (["optimizer.learning_rate=-1"], "config: optimizer.learning_rate; got -1.0"),
+        (
+            ["optimizer.learning_rate=.inf"],
+            "config: optimizer.learning_rate; got inf; expected more than 0, and finite",
+        ),
         (["learn.roughness=.inf"], "config: learn.roughness; got inf; expected at least 0, and finite"),
         (["steps"], "override; got 'steps'; expected KEY=VALUE"),
         (["data.train.0=mine"], "override; got data.train.0; expected nothing inside of 'train'"),
@@ -50,34 +56,34 @@ LESS = "{in_features: -2, out_features: 1}"
         (["loss.chamfer=1"], "config: loss.chamfer; got unknown; expected one of points,"),
         (["loss.points=0"], "config: loss.points; got 0.0; expected a scale > 0"),
         (["loss={markers: 0.001}"], "nothing to compare with"),
-        (["learn.network={module: no.Net, gives: [poisson_ratio]}"], "config: learn.network; got no.Net (No module"),
+        (["learn.network={module: no.Net, outputs: [poisson_ratio]}"], "config: learn.network; got no.Net (No module"),
         (
             [
-                "learn.network={module: torch.nn.Identity, gives: [youngs_modulus, poisson_ratio]}",
+                "learn.network={module: torch.nn.Identity, outputs: [youngs_modulus, poisson_ratio]}",
                 "learn.parameters=[]",
             ],
             "config: learn.network; got a network without any; expected some parameter that may change",
         ),
         (
-            ["learn.network={module: helpers.user_networks.Counting, gives: [poisson_ratio]}", "run.processes=2"],
+            ["learn.network={module: helpers.user_networks.Counting, outputs: [poisson_ratio]}", "run.processes=2"],
             "config: learn.network; got layers with running statistics, on several processes",
         ),
         (["out=~nosuchuser/x"], "config: out; got ~nosuchuser/x"),
-        (["learn.network={module: torch.nn.Softmax, gives: [poisson_ratio]}"], "torch.nn.Softmax: output; got ["),
+        (["learn.network={module: torch.nn.Softmax, outputs: [poisson_ratio]}"], "torch.nn.Softmax: output; got ["),
         (
-            [f"learn.network={{module: torch.nn.Linear, arguments: {SEVEN}, gives: [poisson_ratio]}}"],
+            [f"learn.network={{module: torch.nn.Linear, arguments: {SEVEN}, outputs: [poisson_ratio]}}"],
             "torch.nn.Linear: forward; got RuntimeError: mat1 and mat2 shapes cannot be multiplied",
         ),
         (
-            [f"learn.network={{module: torch.nn.Linear, arguments: {LESS}, gives: [poisson_ratio]}}"],
+            [f"learn.network={{module: torch.nn.Linear, arguments: {LESS}, outputs: [poisson_ratio]}}"],
             "config: learn.network; got torch.nn.Linear (",
         ),
         (
-            [f"learn.network={{module: torch.nn.LSTM, arguments: {TWO}, gives: [poisson_ratio]}}"],
+            [f"learn.network={{module: torch.nn.LSTM, arguments: {TWO}, outputs: [poisson_ratio]}}"],
             "output; got tuple; exp",
         ),
         (
-            [f"learn.network={{module: torch.nn.Bilinear, arguments: {PAIR}, gives: [poisson_ratio]}}"],
+            [f"learn.network={{module: torch.nn.Bilinear, arguments: {PAIR}, outputs: [poisson_ratio]}}"],
             "torch.nn.Bilinear: forward; got TypeError: ",
         ),
         (["data.train={kilometres}"], "expected points of the cloth, in metres"),
@@ -95,10 +101,10 @@ def test_one_line(config, episodes, tmp_path, capsys, options, words):
     for name, place in places.items():
         options, words = [option.replace(name, place) for option in options], words.replace(name, place)
     assert main(["--config", path, *options]) == 2
-    said = capsys.readouterr().err
-    assert said.startswith("fit: ")
-    assert words in said
-    assert said.count("\n") == 1
+    message = capsys.readouterr().err
+    assert message.startswith("fit: ")
+    assert words in message
+    assert message.count("\n") == 1
 
 
 @pytest.mark.parametrize("content", [None, "a: [", "3", "learn: 3", "out: x", "out: x\nout: y"])
@@ -115,7 +121,12 @@ def test_another_problem_is_not_resumed(config, episodes, capsys):
     path = config(optimizer={"steps": 1})
     assert main(["--config", path]) == 0
     moved = [f"data.train=[{episodes}/ep_0,{episodes}/ep_1]", f"data.val={episodes}/ep_2"]
-    changed = ["optimizer.rate=0.2"], ["model.start.youngs_modulus=5e4"], [f"data.train={episodes}/ep_0"], moved
+    changed = (
+        ["optimizer.learning_rate=0.2"],
+        ["model.start.youngs_modulus=5e4"],
+        [f"data.train={episodes}/ep_0"],
+        moved,
+    )
     for other in changed:
         assert main(["--config", path, "--resume", *other]) == 2
         assert "a checkpoint of another run" in capsys.readouterr().err
@@ -129,17 +140,20 @@ def test_fewer_steps_than_were_done_are_refused(config, capsys):
     assert "config: optimizer.steps; got 1; expected at least 2, the steps already done" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("damage", [lambda whole: whole[: len(whole) // 2], lambda _: b"", lambda _: b"no checkpoint"])
+@pytest.mark.parametrize(
+    "damage",
+    [lambda content_bytes: content_bytes[: len(content_bytes) // 2], lambda _: b"", lambda _: b"no checkpoint"],
+)
 def test_a_damaged_checkpoint_is_not_resumed(config, tmp_path, capsys, damage):
     path = config(optimizer={"steps": 1})
     assert main(["--config", path]) == 0
-    (kept,) = tmp_path.rglob("last.ckpt")
-    kept.write_bytes(damage(kept.read_bytes()))
+    (checkpoint,) = tmp_path.rglob("last.ckpt")
+    checkpoint.write_bytes(damage(checkpoint.read_bytes()))
     capsys.readouterr()
     assert main(["--config", path, "--resume"]) == 2
-    said = capsys.readouterr().err
-    assert "which is damaged" in said
-    assert said.count("\n") == 1
+    message = capsys.readouterr().err
+    assert "which is damaged" in message
+    assert message.count("\n") == 1
 
 
 def test_a_network_whose_code_has_changed_is_not_resumed(config, tmp_path, capsys, monkeypatch):
@@ -147,7 +161,7 @@ def test_a_network_whose_code_has_changed_is_not_resumed(config, tmp_path, capsy
     code = "import torch\n\n\nclass Own(torch.nn.Linear):\n    def __init__(self):\n        super().__init__(2, 1)\n"
     (tmp_path / "own_net.py").write_text(code)
     monkeypatch.syspath_prepend(str(tmp_path))
-    path = config(learn={"network": {"module": "own_net.Own", "gives": ["poisson_ratio"]}}, optimizer={"steps": 1})
+    path = config(learn={"network": {"module": "own_net.Own", "outputs": ["poisson_ratio"]}}, optimizer={"steps": 1})
     assert main(["--config", path]) == 0
     (tmp_path / "own_net.py").write_text(code + "\n    def forward(self, x):\n        return 2 * super().forward(x)\n")
     assert main(["--config", path, "--resume", "optimizer.steps=2"]) == 2
@@ -155,7 +169,7 @@ def test_a_network_whose_code_has_changed_is_not_resumed(config, tmp_path, capsy
 
 
 def test_a_network_that_has_changed_is_not_resumed(config, capsys, monkeypatch):
-    network = {"module": "helpers.user_networks.Wavy", "gives": ["poisson_ratio"]}
+    network = {"module": "helpers.user_networks.Wavy", "outputs": ["poisson_ratio"]}
     monkeypatch.setattr("helpers.user_networks.Wavy", lambda: nn.Linear(2, 1), raising=False)
     path = config(optimizer={"steps": 1}, learn={"network": network})
     assert main(["--config", path]) == 0
@@ -165,9 +179,9 @@ def test_a_network_that_has_changed_is_not_resumed(config, capsys, monkeypatch):
 
 
 def test_the_shipped_config_is_read():
-    config = load("demo", ["optimizer.rate=2e-1", "model.start.air.normal=1e0"])
+    config = load("demo", ["optimizer.learning_rate=2e-1", "model.start.air.normal=1e0"])
     assert config.data.train == ["example:bimanual_swing"]
-    assert config.optimizer.rate == 0.2
+    assert config.optimizer.learning_rate == 0.2
     assert config.model.start == {"air.normal": 1.0}
     assert json.dumps(config.loss) == '{"points": 0.001}'
 
@@ -177,11 +191,11 @@ def test_episodes_are_dealt_once_each(count, per_step, world):
     """Together the processes have what one has; every pass has every episode once; passes differ."""
     together, alone = [], []
     for step in range(2 * count):
-        deals = [Deal(count, per_step, 1, lambda: step, rank, world) for rank in range(world)]  # noqa: B023
+        deals = [ShuffledEpisodeSampler(count, per_step, 1, lambda: step, rank, world) for rank in range(world)]  # noqa: B023
         shares = [share for deal in deals for share in deal]
         assert max(map(len, shares)) - min(map(len, shares)) <= 1
         together += sorted(e for share in shares for e in share)
-        alone += next(iter(Deal(count, per_step, 1, lambda: step)))  # noqa: B023
+        alone += next(iter(ShuffledEpisodeSampler(count, per_step, 1, lambda: step)))  # noqa: B023
     assert sorted(together) == sorted(alone)
     passes = [alone[i : i + count] for i in range(0, len(alone), count)]
     assert all(sorted(p) == list(range(count)) for p in passes)

@@ -1,17 +1,27 @@
-"""What is in a recording and how far it can be trusted, before anything is fitted to it.
+"""Inspect a recording before anything is fitted to it: its content, and how far it can be trusted.
 
 report = inspection.inspect(recordings.read("episodes/ep_01"))
 inspection.show(report)
 inspection.draw(report, "out/ep_01")
 """
 
-from ..recordings.timing import Stream
-from .depth_images import Depth
-from .frame_checks import Frames
+from ..recordings.timing import StreamTiming
+from .depth_images import DepthSummary
+from .frame_checks import FrameChecks
 from .inspect_recording import Inspection, inspect
 from .inspection_figure import draw
 from .inspection_tables import show
-from .lag import Lag
-from .noise import Noise
+from .lag import LagEstimate
+from .noise import NoiseEstimate
 
-__all__ = ["Depth", "Frames", "Inspection", "Lag", "Noise", "Stream", "draw", "inspect", "show"]
+__all__ = [
+    "DepthSummary",
+    "FrameChecks",
+    "Inspection",
+    "LagEstimate",
+    "NoiseEstimate",
+    "StreamTiming",
+    "draw",
+    "inspect",
+    "show",
+]

@@ -1,4 +1,4 @@
-"""Depth images, a few of them decoded."""
+"""Summarise a few decoded depth images."""
 
 from __future__ import annotations
 
@@ -6,42 +6,42 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..observe import decode
+from ..observe import decode_depth
 from ..recordings import Camera
 
-LOOKED_AT = 8
+DECODED_IMAGES = 8
 
 
 @dataclass(frozen=True)
-class Depth:
-    """A camera's depth images.
+class DepthSummary:
+    """Summary of a camera's depth images.
 
     Attributes:
-        looked_at: how many were decoded, evenly chosen.
-        invalid: share of their pixels without depth.
-        near, middle, far: m, 5 %, 50 % and 95 % of the depths.
-        distorted: whether the lens distorts.
+        decoded_images: number of images that were decoded, evenly chosen.
+        invalid_fraction: fraction of their pixels without depth.
+        near, median, far: 5 %, 50 % and 95 % quantile of the depths [m].
+        has_distortion: whether the lens has distortion.
     """
 
-    looked_at: int
-    invalid: float
+    decoded_images: int
+    invalid_fraction: float
     near: float
-    middle: float
+    median: float
     far: float
-    distorted: bool
+    has_distortion: bool
 
 
-def depth_of(camera: Camera) -> Depth | None:
-    """A look at the depth images of a camera; None where it has none.
+def summarise_depth(camera: Camera) -> DepthSummary | None:
+    """Summarise the depth images of a camera; None if it has none.
 
     Raises:
-        RecordingError: an image that cannot be decoded.
+        RecordingError: an image cannot be decoded.
         MissingDependency: Pillow is not installed.
     """
     if camera.depth is None or camera.depth_scale is None:
         return None
-    chosen = np.unique(np.linspace(0, len(camera.depth) - 1, LOOKED_AT).astype(int))
-    images = np.stack([decode(camera.depth.load(int(i)), camera.depth_scale) for i in chosen])
-    seen = images[images > 0]
-    near, middle, far = np.quantile(seen, [0.05, 0.5, 0.95]).tolist() if len(seen) else (np.nan,) * 3
-    return Depth(len(chosen), 1 - len(seen) / images.size, near, middle, far, bool(np.any(camera.distortion)))
+    chosen = np.unique(np.linspace(0, len(camera.depth) - 1, DECODED_IMAGES).astype(int))
+    images = np.stack([decode_depth(camera.depth.load(int(i)), camera.depth_scale) for i in chosen])
+    valid = images[images > 0]
+    near, middle, far = np.quantile(valid, [0.05, 0.5, 0.95]).tolist() if len(valid) else (np.nan,) * 3
+    return DepthSummary(len(chosen), 1 - len(valid) / images.size, near, middle, far, bool(np.any(camera.distortion)))

@@ -1,4 +1,4 @@
-"""Which frames cannot be the cloth, how much of it each shows, and what is cut off or stray."""
+"""Check frames: which cannot show the cloth, how much of it each shows, and what is cropped or an outlier."""
 
 from __future__ import annotations
 
@@ -9,157 +9,167 @@ import numpy as np
 from ..errors import MissingDependency, RecordingError
 from ..observe import Segmentation, segment
 from ..recordings import ClothInfo, Markers, PointClouds
-from ..recordings.size_checks import longest, size
-from .crop_planes import cuts
-from .nan_statistics import median
+from ..recordings.size_checks import cloth_size, cloud_diameter
+from .crop_planes import find_crop_planes
+from .nan_statistics import nan_median
 
-TOLERANCE = 0.1  # of the cloth's size
-NEIGHBOURS = 4  # of a marker, whose pattern distances are looked at
-AREA = 8  # neighbours that say how much area a point stands for
-LINK = 3.0  # times the usual distance of neighbours, within which points belong together
-QUERIES, LARGE = 300, 20_000  # points looked at closely, and among so many
+SIZE_TOLERANCE = 0.1  # of the cloth's size, for frames that are accepted
+MARKER_NEIGHBOURS = 4  # of a marker, whose distances are compared with the pattern
+AREA_NEIGHBOURS = 8  # of a point, whose distance gives the density of points
+CLUSTER_GAP_SPACINGS = 3.0  # times the median spacing, within which points belong to one cluster
+MAX_AREA_QUERY_POINTS = 300  # whose neighbours are searched
+MAX_AREA_POINTS = 20_000  # among which they are searched
 
 
 @dataclass(frozen=True, eq=False)
-class Frames:
-    """Frame by frame.
+class FrameChecks:
+    """Checks of the frames of one stream.
 
     Attributes:
-        rejected: [T] bool, that cannot be the cloth.
-        why: how they were told.
-        coverage: [T] share of the markers seen; of clouds, area seen over the cloth's (NaN where that is unknown).
-        removed: of clouds, how many points of all frames each stage of a `Segmentation` takes.
-        cuts: of clouds, bounds at which they end whatever the cloth does: {"z >": 0.075}.
+        rejected: [T] bool, frames that cannot show the cloth.
+        criterion: how they were recognised.
+        coverage: [T] fraction of the markers seen; for clouds, area seen divided by the cloth's area (NaN if unknown).
+        removed: for clouds, number of points that each stage of a `Segmentation` removes from all frames.
+        crop_planes: for clouds, bounds [m] at which they were cropped, e.g. {"z >": 0.075}.
     """
 
     rejected: np.ndarray
-    why: str
+    criterion: str
     coverage: np.ndarray
     removed: dict[str, int]
-    cuts: dict[str, float]
+    crop_planes: dict[str, float]
 
 
-def of_markers(markers: Markers, cloth: ClothInfo) -> Frames:
-    """Frames of markers: their distances must be those of the cloth to 10 %.
+def check_marker_frames(markers: Markers, cloth: ClothInfo) -> FrameChecks:
+    """Check frames of markers: their distances must agree with the cloth to 10 %.
 
-    With ``uv``: median ratio of the distances of neighbours to those in the pattern. Else of a grid (``extra["grid"]``,
-    [rows, columns] of the markers in order) on a sheet: median arc along its rows and along its columns against the
-    sheet's sides. With neither: distances to their own usual ones. A cloth that is folded between most of its markers
-    looks too short.
+    With ``uv``, the median ratio of neighbour distances to pattern distances is compared with 1. Without ``uv``, for a
+    grid of markers (``extra["grid"]``, [rows, columns] in order) on a sheet, the median arc lengths of rows and columns
+    are compared with the sheet's sides. Otherwise distances are compared with their own medians over time. A cloth that
+    is folded between most of its markers looks too short.
     """
     seen = np.isfinite(markers.xyz[..., 0])
     if markers.uv is None and "grid" in markers.extra and cloth.sheet is not None:
-        ratio, why = _arcs(markers, cloth.sheet), "arcs along rows and columns against the sheet's sides"
+        ratio = _grid_length_ratios(markers, cloth.sheet)
+        criterion = "arc lengths of rows and columns against the sheet's sides"
     else:
-        ratio, why = _neighbours(markers)
+        ratio, criterion = _neighbour_distance_ratios(markers)
     with np.errstate(invalid="ignore"):
-        rejected = np.logical_not(np.all(np.abs(ratio - 1) <= TOLERANCE, axis=-1))
-    return Frames(rejected, why, seen.mean(1), {}, {})
+        rejected = np.logical_not(np.all(np.abs(ratio - 1) <= SIZE_TOLERANCE, axis=-1))
+    return FrameChecks(rejected, criterion, seen.mean(1), {}, {})
 
 
-def _arcs(markers: Markers, sheet: tuple[float, float]) -> np.ndarray:
-    """[T, 2] median lengths of rows and columns, each over the side of the sheet that it usually is nearer to."""
-    given = np.asarray(markers.extra["grid"])
-    whole = given.shape == (2,) and given.dtype.kind in "iuf" and bool((given == np.round(given)).all())
-    if not whole or given.min() < 2 or given.prod() != markers.xyz.shape[1]:
+def _grid_length_ratios(markers: Markers, sheet: tuple[float, float]) -> np.ndarray:
+    """Return [T, 2] median arc lengths of rows and columns, divided by the matching sides of the sheet."""
+    grid_size = np.asarray(markers.extra["grid"])
+    is_pair = grid_size.shape == (2,) and grid_size.dtype.kind in "iuf"
+    is_valid = is_pair and bool((grid_size == np.round(grid_size)).all())
+    if not is_valid or grid_size.min() < 2 or grid_size.prod() != markers.xyz.shape[1]:
         raise RecordingError(
             "markers: grid does not fit",
-            got=given.tolist(),
-            expected=f"[rows, columns] of {markers.xyz.shape[1]} markers, two at least of each",
+            got=grid_size.tolist(),
+            expected=f"[rows, columns] of {markers.xyz.shape[1]} markers, at least two of each",
         )
-    rows, columns = given.astype(int).tolist()
+    rows, columns = grid_size.astype(int).tolist()
     grid = markers.xyz.reshape(len(markers.t), rows, columns, 3)
-    arcs = np.stack([median(_arc(np.linalg.norm(np.diff(grid, axis=k), axis=-1), k), -1) for k in (1, 2)], -1)
-    usual = median(arcs, 0)
+    segments = {k: np.linalg.norm(np.diff(grid, axis=k), axis=-1) for k in (1, 2)}
+    arcs = np.stack([nan_median(_sum_lengths(lengths, k), -1) for k, lengths in segments.items()], -1)
+    typical = nan_median(arcs, 0)
     sides = np.array([sheet, sheet[::-1]])
-    return arcs / sides[np.argmin(np.abs(sides - usual).sum(1))]
+    return arcs / sides[np.argmin(np.abs(sides - typical).sum(1))]
 
 
-def _arc(pieces: np.ndarray, axis: int) -> np.ndarray:
-    """Sums of lengths along an axis; up to half of them may be unseen, and count as the mean of the others."""
+def _sum_lengths(pieces: np.ndarray, axis: int) -> np.ndarray:
+    """Sum lengths along an axis; up to half of them may be unseen and count as the mean of the others."""
     seen = np.isfinite(pieces)
-    enough = seen.mean(axis) >= 0.5
+    has_enough = seen.mean(axis) >= 0.5
     mean = np.where(seen, pieces, 0.0).sum(axis) / np.maximum(seen.sum(axis), 1)
-    return np.where(enough, mean * pieces.shape[axis], np.nan)
+    return np.where(has_enough, mean * pieces.shape[axis], np.nan)
 
 
-def _neighbours(markers: Markers) -> tuple[np.ndarray, str]:
-    """[T, 1] median ratio of neighbours' distances to what they should be."""
+def _neighbour_distance_ratios(markers: Markers) -> tuple[np.ndarray, str]:
+    """Return [T, 1] the median ratio of neighbour distances to their expected values, and how these were obtained."""
     xyz = markers.xyz
     if markers.uv is not None:
-        reference, why = markers.uv, "distances of neighbours against the pattern's"
+        reference, criterion = markers.uv, "distances of neighbours against the pattern"
     else:
-        reference, why = median(xyz, 0), "distances of neighbours against their usual ones, size unknown"
-    away = np.linalg.norm(reference[:, None] - reference, axis=-1)
-    np.fill_diagonal(away, np.inf)
-    count = min(NEIGHBOURS, len(away) - 1)
+        reference, criterion = nan_median(xyz, 0), "distances of neighbours against their medians, size unknown"
+    reference_distance = np.linalg.norm(reference[:, None] - reference, axis=-1)
+    np.fill_diagonal(reference_distance, np.inf)
+    count = min(MARKER_NEIGHBOURS, len(reference_distance) - 1)
     if count < 1:
         return np.ones((len(xyz), 1)), "a single marker: nothing to compare"
-    near = np.argsort(away, axis=1)[:, :count]
-    distance = np.linalg.norm(xyz[:, near] - xyz[:, :, None], axis=-1).reshape(len(xyz), -1)
-    pattern = markers.uv is not None
-    expected = np.take_along_axis(away, near, axis=1).ravel() if pattern else median(distance, 0)
-    with np.errstate(divide="ignore", invalid="ignore"):  # of markers in one place
+    neighbours = np.argsort(reference_distance, axis=1)[:, :count]
+    distance = np.linalg.norm(xyz[:, neighbours] - xyz[:, :, None], axis=-1).reshape(len(xyz), -1)
+    if markers.uv is not None:
+        expected = np.take_along_axis(reference_distance, neighbours, axis=1).ravel()
+    else:
+        expected = nan_median(distance, 0)
+    with np.errstate(divide="ignore", invalid="ignore"):  # markers at one place
         ratio = np.where(expected > 0, distance / expected, np.nan)
-    return median(ratio, -1)[:, None], why
+    return nan_median(ratio, -1)[:, None], criterion
 
 
-def of_clouds(clouds: PointClouds, cloth: ClothInfo, held: np.ndarray) -> tuple[Frames, list[str]]:
-    """Frames of clouds: outliers aside, none may be wider than the cloth is long, to 10 %.
+def check_cloud_frames(
+    clouds: PointClouds, cloth: ClothInfo, gripper_positions: np.ndarray
+) -> tuple[FrameChecks, list[str]]:
+    """Check frames of clouds: without outliers, none may exceed the cloth's diameter by more than 10 %.
 
     Args:
         clouds: T frames.
-        cloth: its size.
-        held: [T, G, 3] m, where the grippers are in each frame; G may be 0.
+        cloth: gives the cloth's size.
+        gripper_positions: [T, G, 3] m in each frame; G may be 0.
 
     Returns:
-        The frames, and notes on what could not be done.
+        The checks, and notes on what could not be done.
     """
-    kept, removed, notes = [], {}, []
+    inliers, removed, notes = [], {}, []
     for i in range(len(clouds)):
         cloud = clouds.frame(i)
         try:
-            found = segment(cloud, _stages(cloud))
+            segmented = segment(cloud, _segmentation_for(cloud))
         except MissingDependency as error:
-            kept, removed, notes = [clouds.frame(k) for k in range(len(clouds))], {}, [f"outliers not counted: {error}"]
+            inliers, removed = [clouds.frame(k) for k in range(len(clouds))], {}
+            notes = [f"outliers not counted: {error}"]
             break
-        kept.append(found.points)
-        removed = {stage: removed.get(stage, 0) + count for stage, count in found.removed.items()}
-    length, area = size(cloth)
-    extent = np.array([longest(c) for c in kept])
-    seen = np.array([_area(c) for c in kept]) / (area or np.nan)
-    why = "larger than the cloth" if length else "none: the cloth's size is unknown"
-    rejected = np.greater(extent, (1 + TOLERANCE) * length if length else np.inf) | (extent == 0)
-    found = cuts([clouds.frame(i) for i in range(len(clouds))], kept, cloth, seen, held)
-    return Frames(rejected, why, seen, removed, found), notes
+        inliers.append(segmented.points)
+        removed = {stage: removed.get(stage, 0) + count for stage, count in segmented.removed.items()}
+    length, area = cloth_size(cloth)
+    extent = np.array([cloud_diameter(c) for c in inliers])
+    seen = np.array([_surface_area(c) for c in inliers]) / (area or np.nan)
+    criterion = "larger than the cloth" if length else "none: the cloth's size is unknown"
+    rejected = np.greater(extent, (1 + SIZE_TOLERANCE) * length if length else np.inf) | (extent == 0)
+    planes = find_crop_planes([clouds.frame(i) for i in range(len(clouds))], inliers, cloth, seen, gripper_positions)
+    return FrameChecks(rejected, criterion, seen, removed, planes), notes
 
 
-def _stages(cloud: np.ndarray) -> Segmentation:
-    """Outliers and pieces apart, on the cloud's own scale."""
-    return Segmentation(gap=max(0.01, LINK * _spacing(cloud)), crowd=4)
+def _segmentation_for(cloud: np.ndarray) -> Segmentation:
+    """Return a segmentation that removes outliers and small clusters, scaled to the cloud's spacing."""
+    return Segmentation(cluster_gap=max(0.01, CLUSTER_GAP_SPACINGS * _spacing(cloud)), cluster_core_points=4)
 
 
-def _nearest(cloud: np.ndarray, count: int) -> np.ndarray:
-    """[Q] m, distance of some points to their ``count``-th neighbour."""
+def _kth_neighbour_distances(cloud: np.ndarray, count: int) -> np.ndarray:
+    """Return [Q] the distances [m] of some points to their ``count``-th neighbour."""
     if len(cloud) <= count:
         return np.zeros(0)
-    cloud = cloud - cloud.mean(0)  # squares of small numbers keep their digits
-    some = cloud[np.unique(np.linspace(0, len(cloud) - 1, QUERIES).astype(int))]
-    squared = (some**2).sum(1)[:, None] - 2 * some @ cloud.T + (cloud**2).sum(1)
+    cloud = cloud - cloud.mean(0)  # avoids cancellation in the squared distances
+    queries = cloud[np.unique(np.linspace(0, len(cloud) - 1, MAX_AREA_QUERY_POINTS).astype(int))]
+    squared = (queries**2).sum(1)[:, None] - 2 * queries @ cloud.T + (cloud**2).sum(1)
     return np.sqrt(np.maximum(np.partition(squared, count, axis=1)[:, count], 0))
 
 
 def _spacing(cloud: np.ndarray) -> float:
-    away = _nearest(cloud, 4)
-    return float(np.median(away)) if len(away) else 0.0
+    distance = _kth_neighbour_distances(cloud, 4)
+    return float(np.median(distance)) if len(distance) else 0.0
 
 
-def _area(full: np.ndarray) -> float:
-    """m^2, to about 20 %: of points strewn evenly over a surface, a disc to the k-th neighbour holds k of them.
+def _surface_area(full_cloud: np.ndarray) -> float:
+    """Estimate the area [m^2] of a cloud's surface to about 20 %.
 
-    By the median disc, which has k - 1/3, so that rims and stray points do not count. Where points lie much denser on
-    one part of the surface than on another, it is only an order of magnitude.
+    A disc that reaches to the k-th neighbour contains k points, if points are spread evenly over the surface. The
+    median disc, which contains k - 1/3, is not affected by edges and outliers. If the density of points varies strongly
+    over the surface, the result is only an order of magnitude.
     """
-    cloud = full[:: len(full) // LARGE + 1]
-    away = _nearest(cloud, AREA)
-    return float(len(cloud) * np.pi * np.median(away) ** 2 / (AREA - 1 / 3)) if len(away) else 0.0
+    cloud = full_cloud[:: len(full_cloud) // MAX_AREA_POINTS + 1]
+    distance = _kth_neighbour_distances(cloud, AREA_NEIGHBOURS)
+    return float(len(cloud) * np.pi * np.median(distance) ** 2 / (AREA_NEIGHBOURS - 1 / 3)) if len(distance) else 0.0

@@ -1,4 +1,4 @@
-"""One picture of an episode: when its streams tick, what two frames show, where the clocks agree."""
+"""Figure of an inspection: time stamps, lag, two frames and coverage."""
 
 from __future__ import annotations
 
@@ -8,16 +8,20 @@ from typing import Any
 import numpy as np
 
 from ..identification.pictures import save_figure
-from ..observe import decode
-from ..recordings.timing import GAP, times
+from ..observe import decode_depth
+from ..recordings.timing import GAP_FACTOR, stream_times
 from .inspect_recording import Inspection
 
-INK, GOOD, BAD, SOFT = "#1f6f8b", "#1f6f8b", "#b0653a", "#888888"
-MOST = 3000  # points drawn of a frame
+DATA_COLOUR, WARNING_COLOUR, MUTED_COLOUR = "#1f6f8b", "#b0653a", "#888888"
+MAX_DRAWN_POINTS = 3000  # of one frame
 
 
 def draw(report: Inspection, folder: str | Path) -> Path:
-    """Write inspection.png into ``folder``, atomically; returns its path."""
+    """Write inspection.png into a folder, atomically.
+
+    Returns:
+        The path of the picture.
+    """
     from matplotlib.figure import Figure
 
     folder = Path(folder)
@@ -27,64 +31,64 @@ def draw(report: Inspection, folder: str | Path) -> Path:
         2, 3, height_ratios=[1, 1.5], hspace=0.3, wspace=0.2, top=0.9, bottom=0.07, left=0.06, right=0.98
     )
     _timeline(figure.add_subplot(grid[0, :2]), report)
-    _clock(figure.add_subplot(grid[0, 2]), report)
-    shown = _shown(report)
-    if not shown:
+    _lag_curve(figure.add_subplot(grid[0, 2]), report)
+    drawn_frames = _frames_to_draw(report)
+    if not drawn_frames:
         _images([figure.add_subplot(grid[1, column]) for column in (0, 1)], report)
-    for column, (kind, i) in enumerate(shown):
+    for column, (kind, i) in enumerate(drawn_frames):
         _frame(figure.add_subplot(grid[1, column], projection="3d"), report, kind, i)
-    _quality(figure.add_subplot(grid[1, 2]), report)
+    _coverage(figure.add_subplot(grid[1, 2]), report)
     name = report.recording.path.name if report.recording.path else "recording"
     figure.suptitle(f"{name}: {report.recording.provenance}", fontsize=11, parse_math=False)
     return save_figure(figure, folder / "inspection.png")
 
 
 def _timeline(axis: Any, report: Inspection) -> None:
-    """A tick per frame; gaps in another colour, rejected frames too."""
-    streams = times(report.recording)
-    shift = _shift(report)
+    """Draw a tick for each frame, and gaps and rejected frames in another colour."""
+    streams = stream_times(report.recording)
+    shift = _observation_to_motion_s(report)
     for row, (name, (kind, t)) in enumerate(streams.items()):
-        moved = t if kind in ("motion", "joints", "motion + joints") else t + shift
-        axis.vlines(moved, row - 0.35, row + 0.35, color=GOOD, linewidth=0.6)
-        between = np.diff(t)
-        for k in np.flatnonzero(between > GAP * np.median(between)) if len(between) else []:
-            axis.plot(moved[k : k + 2], [row, row], color=BAD, linewidth=3, solid_capstyle="butt")
+        motion_time = t if kind in ("motion", "joints", "motion + joints") else t + shift
+        axis.vlines(motion_time, row - 0.35, row + 0.35, color=DATA_COLOUR, linewidth=0.6)
+        intervals = np.diff(t)
+        for k in np.flatnonzero(intervals > GAP_FACTOR * np.median(intervals)) if len(intervals) else []:
+            axis.plot(motion_time[k : k + 2], [row, row], color=WARNING_COLOUR, linewidth=3, solid_capstyle="butt")
         if name in report.frames:
             axis.plot(
-                moved[report.frames[name].rejected],
+                motion_time[report.frames[name].rejected],
                 np.full(report.frames[name].rejected.sum(), row + 0.42),
                 "v",
-                color=BAD,
+                color=WARNING_COLOUR,
                 markersize=4,
             )
     axis.set_yticks(range(len(streams)), list(streams), parse_math=False)
     axis.set(xlabel="time on the motion clock [s]")
-    axis.set_title("streams: bars are gaps, triangles rejected frames", fontsize=10)
+    axis.set_title("time stamps of the streams (bars: gaps, triangles: rejected frames)", fontsize=10)
     axis.invert_yaxis()
 
 
-def _shift(report: Inspection) -> float:
-    """s, from the observations' clock to the motion's."""
-    return report.recording.clock_offset if report.lag is None else -report.lag.trusted
+def _observation_to_motion_s(report: Inspection) -> float:
+    """Return the shift [s] from the observation clock to the motion clock."""
+    return report.recording.clock_offset if report.lag is None else -report.lag.effective
 
 
-def _clock(axis: Any, report: Inspection) -> None:
+def _lag_curve(axis: Any, report: Inspection) -> None:
     axis.set_title("lag of the observations", fontsize=10)
-    late = report.lag
-    if late is None:
-        return _nothing(axis, "no motion, or too few observations")
-    axis.plot(late.tried, 1e3 * late.cost, color=INK)
-    axis.axvline(late.stated, color=SOFT, linestyle="--", label=f"recording says {late.stated:.3f} s")
-    if late.told:
-        axis.axvspan(late.value - 2 * late.std, late.value + 2 * late.std, color=BAD, alpha=0.25)
-        axis.axvline(late.value, color=BAD, label=f"found {late.value:.3f} ± {late.std:.3f} s")
-    axis.set(xlabel="lag tried [s]", ylabel="misfit of what is held [mm]")
+    lag = report.lag
+    if lag is None:
+        return _write_reason(axis, "no motion, or too few observations")
+    axis.plot(lag.candidates, 1e3 * lag.cost, color=DATA_COLOUR)
+    axis.axvline(lag.recorded, color=MUTED_COLOUR, linestyle="--", label=f"recording says {lag.recorded:.3f} s")
+    if lag.is_determined:
+        axis.axvspan(lag.value - 2 * lag.std, lag.value + 2 * lag.std, color=WARNING_COLOUR, alpha=0.25)
+        axis.axvline(lag.value, color=WARNING_COLOUR, label=f"estimate {lag.value:.3f} ± {lag.std:.3f} s")
+    axis.set(xlabel="candidate lag [s]", ylabel="misfit of the gripped cloth [mm]")
     axis.locator_params(axis="x", nbins=5)
     axis.legend(fontsize=8)
 
 
-def _shown(report: Inspection) -> list[tuple[str, int]]:
-    """Two frames that are not rejected, a third and two thirds through: of markers, or else of clouds."""
+def _frames_to_draw(report: Inspection) -> list[tuple[str, int]]:
+    """Return two accepted frames at one and two thirds of the time, of markers or else of clouds."""
     for kind in ("markers", "points"):
         if kind in report.frames:
             good = np.flatnonzero(~report.frames[kind].rejected)
@@ -94,42 +98,44 @@ def _shown(report: Inspection) -> list[tuple[str, int]]:
 
 
 def _images(axes: list[Any], report: Inspection) -> None:
-    """Two depth images of a camera, where there are no frames of points to draw."""
-    seen = [
+    """Draw two depth images of a camera, if there are no points or markers to draw."""
+    depth_streams = [
         (name, camera.depth, camera.depth_scale)
         for name, camera in report.recording.cameras.items()
         if name in report.depth and camera.depth is not None and camera.depth_scale is not None
     ]
     for share, axis in zip((1, 2), axes, strict=True):
-        if not seen:
-            _nothing(axis, "no good frame" if report.frames else "nothing to draw: no points, no markers, no depth")
+        if not depth_streams:
+            _write_reason(
+                axis, "no good frame" if report.frames else "nothing to draw: no points, no markers, no depth"
+            )
             continue
-        name, images, scale = seen[0]
+        name, images, scale = depth_streams[0]
         i = len(images) * share // 3
-        depth = decode(images.load(i), scale)
-        shown = axis.imshow(np.where(depth > 0, depth, np.nan), cmap="viridis")
-        axis.figure.colorbar(shown, ax=axis, shrink=0.6, label="depth [m]")
+        depth = decode_depth(images.load(i), scale)
+        drawn_frames = axis.imshow(np.where(depth > 0, depth, np.nan), cmap="viridis")
+        axis.figure.colorbar(drawn_frames, ax=axis, shrink=0.6, label="depth [m]")
         axis.set(xticks=[], yticks=[])
         axis.set_title(f"{name}, depth image {i}", fontsize=10, parse_math=False)
 
 
 def _frame(axis: Any, report: Inspection, kind: str, i: int) -> None:
-    """A frame with the grippers' whole paths and places."""
+    """Draw a frame with the grippers' positions and paths."""
     recording = report.recording
     stream = getattr(recording, kind)
     cloud = stream.xyz[i] if kind == "markers" else stream.frame(i)
     cloud = cloud[np.isfinite(cloud[:, 0])]
-    cloud = cloud[:: max(1, len(cloud) // MOST)]
-    t = stream.t[i] + _shift(report)
-    axis.scatter(*cloud.T, s=6 if len(cloud) < 500 else 1, color=INK, depthshade=False)
-    everything = [cloud]
+    cloud = cloud[:: max(1, len(cloud) // MAX_DRAWN_POINTS)]
+    t = stream.t[i] + _observation_to_motion_s(report)
+    axis.scatter(*cloud.T, s=6 if len(cloud) < 500 else 1, color=DATA_COLOUR, depthshade=False)
+    extents = [cloud]
     for name, path in report.paths.items():
-        axis.plot(*path.position.T, color=SOFT, linewidth=0.8)
-        here = path.at(np.array([t]))[0]
-        axis.scatter(*here.T, s=40, color=BAD, marker="s", depthshade=False)
-        axis.text(*here[0], f" {name}", fontsize=7, color=BAD, parse_math=False)
-        everything.append(path.position)
-    points = np.concatenate(everything)
+        axis.plot(*path.position.T, color=MUTED_COLOUR, linewidth=0.8)
+        position = path.at(np.array([t]))[0]
+        axis.scatter(*position.T, s=40, color=WARNING_COLOUR, marker="s", depthshade=False)
+        axis.text(*position[0], f" {name}", fontsize=7, color=WARNING_COLOUR, parse_math=False)
+        extents.append(path.position)
+    points = np.concatenate(extents)
     middle, half = (points.max(0) + points.min(0)) / 2, max(np.ptp(points, axis=0).max() / 2, 1e-3)
     axis.set(**{f"{a}lim": (m - half, m + half) for a, m in zip("xyz", middle, strict=True)})
     axis.set_box_aspect((1, 1, 1), zoom=1.1)
@@ -140,15 +146,15 @@ def _frame(axis: Any, report: Inspection, kind: str, i: int) -> None:
     axis.set_title(f"{kind}, frame {i}, t = {stream.t[i]:.2f} s", fontsize=10, parse_math=False)
 
 
-def _quality(axis: Any, report: Inspection) -> None:
-    """Coverage of every frame."""
+def _coverage(axis: Any, report: Inspection) -> None:
+    """Draw the coverage of each frame."""
     axis.set_title("coverage by frame", fontsize=10)
     if not any(np.isfinite(f.coverage).any() for f in report.frames.values()):
-        return _nothing(axis, "nothing observed, or the cloth's size is unknown")
-    for (name, found), marker in zip(report.frames.items(), "os", strict=False):
+        return _write_reason(axis, "nothing observed, or the cloth's size is unknown")
+    for (name, checks), marker in zip(report.frames.items(), "os", strict=False):
         t = getattr(report.recording, name).t
-        axis.plot(t, found.coverage, marker, markersize=3, color=INK, label=name, fillstyle="none")
-        axis.plot(t[found.rejected], found.coverage[found.rejected], "v", markersize=5, color=BAD)
+        axis.plot(t, checks.coverage, marker, markersize=3, color=DATA_COLOUR, label=name, fillstyle="none")
+        axis.plot(t[checks.rejected], checks.coverage[checks.rejected], "v", markersize=5, color=WARNING_COLOUR)
     axis.set(
         xlabel="time on the observation clock [s]",
         ylim=(0, 1.05 * max(0.1, *(np.nanmax(f.coverage, initial=0) for f in report.frames.values()))),
@@ -156,6 +162,6 @@ def _quality(axis: Any, report: Inspection) -> None:
     axis.legend(fontsize=8)
 
 
-def _nothing(axis: Any, why: str) -> None:
-    axis.text(0.5, 0.5, why, ha="center", va="center", color=SOFT, transform=axis.transAxes)
+def _write_reason(axis: Any, reason: str) -> None:
+    axis.text(0.5, 0.5, reason, ha="center", va="center", color=MUTED_COLOUR, transform=axis.transAxes)
     axis.set_axis_off()

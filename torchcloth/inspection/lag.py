@@ -1,4 +1,4 @@
-"""How much later the observations are stamped than the motion that they show."""
+"""Estimate the lag of observation stamps behind motion stamps."""
 
 from __future__ import annotations
 
@@ -10,124 +10,133 @@ import numpy as np
 
 from ..recordings import Markers, PointClouds, Recording
 from ..robots.paths import GripperPath  # pyright: ignore[reportMissingImports] - mapped from robots/ at installation
-from .nan_statistics import median
+from .nan_statistics import nan_median
 
-SEARCH, COARSE = 1.0, 0.02  # s to either side; step
-NEAR, FINE = 0.16, 0.004  # the same about the least
-VALLEY = 0.1  # of the way from the least misfit to the usual, below which the minimum's valley lies
-SCALE = 5e-3  # m, beyond which a residual counts less
-SHARE, FEWEST = 0.1, 3  # of the markers, that are taken to be held
-NEAREST = 5  # points of a cloud, whose mean is taken to be held
-FRAMES, POINTS = 300, 1000  # looked at, at most
-BLOCKS = 10  # left out in turn
-WORST = 0.05  # s of standard error, and
-CONTRAST = 1.15  # of the usual misfit over the least, beyond which a lag is none
-CLEARLY, LEAST = 3.0, 0.02  # standard errors and s, by which a lag is another than the stated one
-CANNOT = (
-    "it is what the observed cloth near the grippers does later than the grippers: delay of stamps, of the cloth's "
-    "own follow-up and of a loose grip are one; of a motion at constant speed it is not told apart from an offset"
+LAG_SEARCH_RANGE_S, COARSE_LAG_STEP_S = 1.0, 0.02  # to either side of the recorded lag
+FINE_LAG_RANGE_S, FINE_LAG_STEP_S = 0.16, 0.004  # to either side of the coarse minimum
+VALLEY_FRACTION = 0.1  # of the way from the smallest to the median misfit; lower values belong to the minimum
+RESIDUAL_SCALE_M = 5e-3  # above, residuals count linearly instead of quadratically
+GRIPPED_MARKER_FRACTION = 0.1  # of the markers, the nearest ones, are assumed to be gripped
+MIN_SAMPLES = 3  # of markers, frames and candidates
+GRIPPED_POINTS = 5  # of a cloud, the nearest ones, whose mean is assumed to be gripped
+MAX_LAG_FRAMES, MAX_POINTS_PER_FRAME = 300, 1000  # used, evenly chosen
+JACKKNIFE_BLOCKS = 10
+MAX_LAG_STD_S = 0.05  # of a lag that is determined
+MIN_COST_CONTRAST = 1.15  # median over smallest misfit, of a lag that is determined
+MIN_DIFFERENCE_STDS, MIN_LAG_DIFFERENCE_S = 3.0, 0.02  # both must be exceeded by the difference from the recorded lag
+LAG_CAVEAT = (
+    "it is the delay of the observed cloth near the grippers behind the grippers. It includes the delay of stamps, the "
+    "delay of the cloth itself and that of a loose grip. At constant speed a lag is the same as an offset"
 )
 
 
 @dataclass(frozen=True, eq=False)
-class Lag:
+class LagEstimate:
     """Observation stamps minus motion stamps of the same event.
 
     Attributes:
-        value: s.
-        std: s, standard error: stretches of the recording left out in turn (jackknife), which allows for errors that
-            last, and what the misfit and the unsteadiness of the motion allow at best.
-        told: whether the recording tells it: a minimum inside the search, a standard error below 0.05 s, and a misfit
-            clearly below the usual.
-        stated: s, what the recording says (minus its clock_offset).
-        misfit: m, mean distance from the rigid follow-up at the least.
-        tried, cost: [N] s and [N] m, the curve whose minimum it is.
+        value: estimated lag [s].
+        std: standard error [s]: a jackknife over blocks of time, which allows for correlated errors, combined with the
+            bound from the misfit and the variation of the velocity.
+        is_determined: whether the recording determines the lag. The minimum must lie inside the search range, the
+            standard error below 0.05 s, and the misfit clearly below its median.
+        recorded: lag according to the recording [s], minus its clock_offset.
+        misfit: mean distance from rigid motion with the gripper at the minimum [m].
+        candidates: [N] s, the lags that were tried.
+        cost: [N] m, their misfits.
     """
 
     value: float
     std: float
-    told: bool
-    stated: float
+    is_determined: bool
+    recorded: float
     misfit: float
-    tried: np.ndarray
+    candidates: np.ndarray
     cost: np.ndarray
 
     @property
-    def differs(self) -> bool:
-        """Whether it is told, and clearly another than what the recording says."""
-        return self.told and abs(self.value - self.stated) > max(CLEARLY * self.std, LEAST)
+    def differs_from_recorded(self) -> bool:
+        """Whether the lag is determined and differs significantly from the recorded lag."""
+        tolerance = max(MIN_DIFFERENCE_STDS * self.std, MIN_LAG_DIFFERENCE_S)
+        return self.is_determined and abs(self.value - self.recorded) > tolerance
 
     @property
-    def trusted(self) -> float:
-        """s, to move observations by: the value where it differs, else what the recording says."""
-        return self.value if self.differs else self.stated
+    def effective(self) -> float:
+        """Lag to correct for [s]: the estimate if it differs from the recorded lag, else the recorded lag."""
+        return self.value if self.differs_from_recorded else self.recorded
 
 
-def lag(
+def estimate_lag(
     recording: Recording, paths: dict[str, GripperPath], use: Mapping[str, np.ndarray] = MappingProxyType({})
-) -> Lag | None:
-    """The lag of markers, or else of the clouds; None without motion or observations.
+) -> LagEstimate | None:
+    """Estimate the lag of the markers, or of the clouds if there are none; None without motion or observations.
 
-    Observed points near a gripper follow it as if they were fixed to it: x(t) = p(t - lag) + R(t - lag) b with a
-    constant b. The markers, or points of a cloud, that are nearest to the gripper are taken. The lag is
-    where the residuals' mean soft absolute value is least, over all grippers.
+    Observed points near a gripper are assumed to be fixed to it: x(t) = p(t - lag) + R(t - lag) b with a constant b.
+    The markers or cloud points nearest to the gripper are used. The lag minimises the mean soft absolute value of the
+    residuals over all grippers.
 
     Args:
         recording: the episode.
         paths: of its grippers.
-        use: [T] bool of "markers" and "points", frames that are not rejected.
+        use: [T] bool for "markers" and "points", frames that are not rejected.
     """
     kind = "markers" if recording.markers is not None else "points"
     stream = getattr(recording, kind)
     if stream is None or not paths:
         return None
-    good = np.flatnonzero(use.get(kind, np.ones(len(stream.t), bool)))
-    if len(good) < BLOCKS:
+    usable = np.flatnonzero(use.get(kind, np.ones(len(stream.t), bool)))
+    if len(usable) < JACKKNIFE_BLOCKS:
         return None
-    frames = good[np.unique(np.linspace(0, len(good) - 1, FRAMES).astype(int))]
-    follow = _MarkersFollow(stream, frames) if isinstance(stream, Markers) else _CloudFollows(stream, frames)
+    frames = usable[np.unique(np.linspace(0, len(usable) - 1, MAX_LAG_FRAMES).astype(int))]
+    follower = _MarkerFollower(stream, frames) if isinstance(stream, Markers) else _CloudFollower(stream, frames)
     t = stream.t[frames]
-    tried = np.arange(-SEARCH, SEARCH + COARSE / 2, COARSE) - recording.clock_offset
-    cost = _mean(_curve(follow, paths, t, tried))
-    tried, cost = tried[np.isfinite(cost)], cost[np.isfinite(cost)]
-    if len(cost) < FEWEST:
+    candidates = _symmetric_grid(LAG_SEARCH_RANGE_S, COARSE_LAG_STEP_S) - recording.clock_offset
+    cost = _frame_mean(_curve(follower, paths, t, candidates))
+    candidates, cost = candidates[np.isfinite(cost)], cost[np.isfinite(cost)]
+    if len(cost) < MIN_SAMPLES:
         return None
     best = int(np.argmin(cost))
-    close = tried[best] + np.arange(-NEAR, NEAR + FINE / 2, FINE)
-    fine = _curve(follow, paths, t, close)
-    level = cost[best] + VALLEY * (np.median(cost) - cost[best])
-    value = _bottom(close, _mean(fine), level)
+    fine_candidates = candidates[best] + _symmetric_grid(FINE_LAG_RANGE_S, FINE_LAG_STEP_S)
+    fine = _curve(follower, paths, t, fine_candidates)
+    level = cost[best] + VALLEY_FRACTION * (np.median(cost) - cost[best])
+    value = _parabola_vertex(fine_candidates, _frame_mean(fine), level)
     if not np.isfinite(value):
         return None
-    block = np.arange(len(t)) * BLOCKS // len(t)
-    others = np.array([_bottom(close, _mean(fine[block != k]), level) for k in range(BLOCKS)])
-    misfit = float(np.nanmin(_mean(fine)))
-    jackknife = np.sqrt((BLOCKS - 1) / BLOCKS * ((others - others.mean()) ** 2).sum())
-    std = float(np.hypot(jackknife, misfit / max(_unsteady(paths, t - value) * np.sqrt(len(t)), 1e-9)))
-    inside = 0 < best < len(tried) - 1
-    told = bool(inside and std < WORST and np.median(cost) > CONTRAST * cost[best])
-    return Lag(value, std, told, 0.0 - recording.clock_offset, misfit, tried, cost)
+    block = np.arange(len(t)) * JACKKNIFE_BLOCKS // len(t)
+    without_block = (_frame_mean(fine[block != k]) for k in range(JACKKNIFE_BLOCKS))
+    replicates = np.array([_parabola_vertex(fine_candidates, curve, level) for curve in without_block])
+    misfit = float(np.nanmin(_frame_mean(fine)))
+    jackknife = np.sqrt((JACKKNIFE_BLOCKS - 1) / JACKKNIFE_BLOCKS * ((replicates - replicates.mean()) ** 2).sum())
+    std = float(np.hypot(jackknife, misfit / max(_velocity_scatter(paths, t - value) * np.sqrt(len(t)), 1e-9)))
+    is_interior = 0 < best < len(candidates) - 1
+    is_determined = bool(is_interior and std < MAX_LAG_STD_S and np.median(cost) > MIN_COST_CONTRAST * cost[best])
+    return LagEstimate(value, std, is_determined, 0.0 - recording.clock_offset, misfit, candidates, cost)
 
 
-class _MarkersFollow:
+def _symmetric_grid(half_range: float, step: float) -> np.ndarray:
+    return np.arange(-half_range, half_range + step / 2, step)
+
+
+class _MarkerFollower:
     """Offsets of tracked points from a gripper, in axes that turn with it."""
 
     def __init__(self, markers: Markers, frames: np.ndarray) -> None:
         xyz = markers.xyz[frames]
-        well = np.isfinite(xyz[..., 0]).mean(0) > 0.5
-        self.xyz = xyz[:, well if well.any() else slice(None)]
+        is_mostly_seen = np.isfinite(xyz[..., 0]).mean(0) > 0.5
+        self.xyz = xyz[:, is_mostly_seen if is_mostly_seen.any() else slice(None)]
 
     def misfit(self, covered: np.ndarray, position: np.ndarray, rotation: np.ndarray) -> np.ndarray:
-        """[C] m of the markers that are nearest, in the covered frames."""
+        """Return [C] m, the misfit of the nearest markers in the covered frames."""
         offset = np.einsum("fij,fmi->fmj", rotation, self.xyz[covered] - position[:, None])
-        count = max(FEWEST, int(SHARE * offset.shape[1]))
-        near = offset[:, np.argsort(median((offset**2).sum(-1), 0))[:count]]
-        away = _soft(near - median(near, 0))
-        seen = np.isfinite(away)
-        return np.where(seen.any(1), np.where(seen, away, 0.0).sum(1) / np.maximum(seen.sum(1), 1), SCALE)
+        count = max(MIN_SAMPLES, int(GRIPPED_MARKER_FRACTION * offset.shape[1]))
+        near = offset[:, np.argsort(nan_median((offset**2).sum(-1), 0))[:count]]
+        deviation = _soft_absolute(near - nan_median(near, 0))
+        seen = np.isfinite(deviation)
+        mean = np.where(seen, deviation, 0.0).sum(1) / np.maximum(seen.sum(1), 1)
+        return np.where(seen.any(1), mean, RESIDUAL_SCALE_M)
 
 
-class _CloudFollows:
+class _CloudFollower:
     """Offset of the nearest points from a gripper, in axes that turn with it."""
 
     def __init__(self, clouds: PointClouds, frames: np.ndarray) -> None:
@@ -135,70 +144,73 @@ class _CloudFollows:
         self.clouds = []
         for i in frames:
             cloud = clouds.xyz[ends[i] - clouds.counts[i] : ends[i]]
-            self.clouds.append(cloud[:: max(1, len(cloud) // POINTS)])
+            self.clouds.append(cloud[:: max(1, len(cloud) // MAX_POINTS_PER_FRAME)])
 
     def misfit(self, covered: np.ndarray, position: np.ndarray, rotation: np.ndarray) -> np.ndarray:
-        """[C] m, in the covered frames."""
+        """Return [C] m, the misfit of the nearest points in the covered frames."""
         offset = np.empty_like(position)
         for f, cloud in enumerate(self.clouds[k] for k in np.flatnonzero(covered)):
-            away = ((cloud - position[f]) ** 2).sum(1)
-            count = min(NEAREST, len(cloud))
-            nearest = cloud[np.argpartition(away, count - 1)[:count]].mean(0)
+            deviation = ((cloud - position[f]) ** 2).sum(1)
+            count = min(GRIPPED_POINTS, len(cloud))
+            nearest = cloud[np.argpartition(deviation, count - 1)[:count]].mean(0)
             offset[f] = (nearest - position[f]) @ rotation[f]
-        return _soft(offset - np.median(offset, axis=0))
+        return _soft_absolute(offset - np.median(offset, axis=0))
 
 
 def _curve(
-    follow: _MarkersFollow | _CloudFollows, paths: dict[str, GripperPath], t: np.ndarray, tried: np.ndarray
+    follower: _MarkerFollower | _CloudFollower, paths: dict[str, GripperPath], t: np.ndarray, candidates: np.ndarray
 ) -> np.ndarray:
-    """Misfit [F, N] m, mean over the grippers; NaN where a path does not reach."""
+    """Return the misfit [F, N] m of each frame and candidate, mean over the grippers; NaN outside of a path's time."""
     start, end = max(p.t[0] for p in paths.values()), min(p.t[-1] for p in paths.values())
-    out = np.full((len(t), len(tried)), np.nan)
-    for k, by in enumerate(tried):
-        covered = (t - by >= start) & (t - by <= end)
-        if covered.sum() >= FEWEST:
-            each = [follow.misfit(covered, *_turned(path, t[covered] - by)) for path in paths.values()]
-            out[covered, k] = np.mean(each, axis=0)
-    return out
+    curve = np.full((len(t), len(candidates)), np.nan)
+    for k, candidate in enumerate(candidates):
+        covered = (t - candidate >= start) & (t - candidate <= end)
+        if covered.sum() >= MIN_SAMPLES:
+            poses = [_pose_since_start(path, t[covered] - candidate) for path in paths.values()]
+            curve[covered, k] = np.mean([follower.misfit(covered, *pose) for pose in poses], axis=0)
+    return curve
 
 
-def _unsteady(paths: dict[str, GripperPath], t: np.ndarray) -> float:
-    """Standard deviation of the grippers' velocity, m/s: what a lag shows against, as a mean velocity is an offset."""
+def _velocity_scatter(paths: dict[str, GripperPath], t: np.ndarray) -> float:
+    """Return the standard deviation of the grippers' velocity [m/s].
+
+    It determines the lag: at constant velocity a lag is the same as an offset.
+    """
     step = 0.05
     speeds = [(path.at(t + step)[0] - path.at(t - step)[0]) / (2 * step) for path in paths.values()]
     start, end = max(p.t[0] for p in paths.values()) + step, min(p.t[-1] for p in paths.values()) - step
-    inside = (t > start) & (t < end)
-    return float(np.sqrt(np.mean([v[inside].var(0).sum() for v in speeds]))) if inside.sum() > 1 else 0.0
+    is_interior = (t > start) & (t < end)
+    return float(np.sqrt(np.mean([v[is_interior].var(0).sum() for v in speeds]))) if is_interior.sum() > 1 else 0.0
 
 
-def _mean(curve: np.ndarray) -> np.ndarray:
-    """[N] mean over the frames; NaN where the motion covers less than half of them."""
+def _frame_mean(curve: np.ndarray) -> np.ndarray:
+    """Return [N] the mean over the frames; NaN where the motion covers less than half of them."""
     seen = np.isfinite(curve)
     mean = np.where(seen, curve, 0.0).sum(0) / np.maximum(seen.sum(0), 1)
     return np.where(seen.mean(0) >= 0.5, mean, np.nan)
 
 
-def _turned(path: GripperPath, t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Position, and rotation since the start of the path: with it, axes stay the world's as long as nothing turns."""
+def _pose_since_start(path: GripperPath, t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return position [m] and rotation since the start of the path; without rotation, axes stay those of the world."""
     position, rotation = path.at(t)
     return position, rotation @ path.rotation[0].T
 
 
-def _soft(offset: np.ndarray) -> np.ndarray:
-    """Misfit [...] m of offsets [..., 3] m: quadratic below SCALE, linear beyond, axis by axis.
+def _soft_absolute(offset: np.ndarray) -> np.ndarray:
+    """Return the misfit [...] m of offsets [..., 3] m: quadratic below the scale, linear above, for each axis.
 
-    By axis, so that an error across the motion, which no lag mends, does not drown the one along it.
+    Axes are separate, so that an error across the motion, which no lag can remove, does not mask the one along it.
     """
-    return SCALE * (np.sqrt(1 + (offset / SCALE) ** 2) - 1).sum(-1)
+    return RESIDUAL_SCALE_M * (np.sqrt(1 + (offset / RESIDUAL_SCALE_M) ** 2) - 1).sum(-1)
 
 
-def _bottom(tried: np.ndarray, cost: np.ndarray, level: float) -> float:
-    """Vertex of the parabola through the valley: what lies below the level, 5 values at least; NaN of too few."""
-    tried, cost = tried[np.isfinite(cost)], cost[np.isfinite(cost)]
-    if len(cost) < FEWEST:
+def _parabola_vertex(candidates: np.ndarray, cost: np.ndarray, level: float) -> float:
+    """Return the vertex of a parabola through the values below ``level``, at least 5; NaN if there are too few."""
+    candidates, cost = candidates[np.isfinite(cost)], cost[np.isfinite(cost)]
+    if len(cost) < MIN_SAMPLES:
         return float("nan")
     order = np.argsort(cost)
     valley = cost <= max(level, cost[order[min(4, len(cost) - 1)]])
-    a, b, _ = np.polyfit(tried[valley], cost[valley], 2)
-    vertex = -b / (2 * a) if a > 0 else tried[order[0]]
-    return float(np.clip(vertex, tried[valley].min(), tried[valley].max()))
+    a, b, _ = np.polyfit(candidates[valley], cost[valley], 2)
+    vertex = -b / (2 * a) if a > 0 else candidates[order[0]]
+    return float(np.clip(vertex, candidates[valley].min(), candidates[valley].max()))

@@ -1,4 +1,4 @@
-"""How much the sensor's readings scatter, from frames in which the grippers stand still."""
+"""Estimate sensor noise from frames in which the grippers stand still."""
 
 from __future__ import annotations
 
@@ -7,91 +7,102 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..recordings import Markers, PointClouds
-from .nan_statistics import median
+from .nan_statistics import nan_median
 
-SHORTEST = 6  # frames
-QUIET = 2.0  # of a coordinate's scatter over that of its steps, 1 of white noise: beyond, the cloth was moving
-ALIKE = 1.5  # times the scatter of the quietest stretch: beyond, too
-PATCH = 20  # points of a local surface
-QUADRIC = 6  # its unknowns
-QUERIES, FRAMES, LARGE = 200, 20, 20_000  # points looked at closely, in so many frames, among so many points
-TO_SIGMA = 1.4826  # of the median absolute deviation
+MIN_STILL_FRAMES = 6  # in a run
+MAX_SCATTER_TO_STEP_RATIO = 2.0  # scatter of coordinates over scatter of steps (1 for white noise) of cloth at rest
+MAX_SCATTER_TO_QUIETEST_RATIO = 1.5  # scatter over that of the quietest run, of cloth at rest
+PATCH_POINTS = 20  # of a local surface
+QUADRIC_COEFFICIENTS = 6
+MAX_PATCHES, MAX_NOISE_FRAMES, MAX_CLOUD_POINTS = 200, 20, 20_000  # per frame, in all, among which neighbours are found
+MAD_TO_STD = 1.4826  # standard deviation over median absolute deviation of a normal distribution
 
 
 @dataclass(frozen=True)
-class Noise:
-    """One standard deviation of a coordinate, in m.
+class NoiseEstimate:
+    """Standard deviation of a measured coordinate.
 
     Attributes:
-        std: of markers, along the direction in which they scatter most; of clouds, along the surface's normal.
-        axes: x, y, z of markers; None of clouds.
-        frames: how many it was measured on.
-        method: what was done.
+        std: [m], for markers along the direction of largest scatter, for clouds along the surface's normal.
+        std_xyz: [m], along x, y and z for markers; None for clouds.
+        frames: number of frames that were used.
+        method: how it was measured.
     """
 
     std: float
-    axes: tuple[float, float, float] | None
+    std_xyz: tuple[float, float, float] | None
     frames: int
     method: str
 
 
-def of_markers(markers: Markers, still: np.ndarray, use: np.ndarray) -> Noise | None:
-    """Robust scatter of each marker about its place in each stretch of still frames; the median over markers.
+def estimate_marker_noise(markers: Markers, still: np.ndarray, use: np.ndarray) -> NoiseEstimate | None:
+    """Estimate marker noise as the robust scatter about the mean position while the cloth is at rest.
 
-    A stretch counts where coordinates scatter as much as their steps say, which they do only if the cloth hangs still.
-    If none does, the steps between frames must do, and bound the noise from above.
+    In each run of still frames, the scatter of coordinates is compared with the scatter of their steps. They agree only
+    if the cloth is at rest. If no run is at rest, the steps between frames give an upper bound of the noise.
 
     Args:
         markers: the stream.
-        still: [T] bool, frames in which all grippers stand.
+        still: [T] bool, frames in which all grippers stand still.
         use: [T] bool, frames that are not rejected.
+
+    Returns:
+        The median over the markers; None if it cannot be measured.
     """
-    stretches = [markers.xyz[stretch][use[stretch]] for stretch in _stretches(still)]
-    stretches = [xyz - median(xyz, 0) for xyz in stretches if len(xyz) >= SHORTEST]
-    told = lambda xyz: np.isfinite([_scatter(xyz), _scatter(np.diff(xyz, axis=0))]).all()  # noqa: E731
-    stretches = [xyz for xyz in stretches if told(xyz)]
-    if not stretches:
+    runs = [markers.xyz[run][use[run]] for run in _still_runs(still)]
+    runs = [xyz - nan_median(xyz, 0) for xyz in runs if len(xyz) >= MIN_STILL_FRAMES]
+    runs = [xyz for xyz in runs if np.isfinite([_scatter(xyz), _scatter(np.diff(xyz, axis=0))]).all()]
+    if not runs:
         return None
-    about = [_scatter(xyz) for xyz in stretches]
-    steps = [_scatter(np.diff(xyz, axis=0)) / np.sqrt(2) for xyz in stretches]
-    size, size_of_steps = np.linalg.norm(about, axis=1), np.linalg.norm(steps, axis=1)
-    quiet = np.flatnonzero((size <= QUIET * size_of_steps) & (size <= ALIKE * size.min()))
-    if len(quiet):
-        chosen, method = [stretches[k] for k in quiet], "about their place while all stands"
+    scatter = [_scatter(xyz) for xyz in runs]
+    step_scatter = [_scatter(np.diff(xyz, axis=0)) / np.sqrt(2) for xyz in runs]
+    size, step_size = np.linalg.norm(scatter, axis=1), np.linalg.norm(step_scatter, axis=1)
+    at_rest = np.flatnonzero(
+        (size <= MAX_SCATTER_TO_STEP_RATIO * step_size) & (size <= MAX_SCATTER_TO_QUIETEST_RATIO * size.min())
+    )
+    if len(at_rest):
+        deviations, method = [runs[k] for k in at_rest], "scatter about the mean position at rest"
     else:
-        chosen = [np.diff(xyz, axis=0) / np.sqrt(2) for xyz in stretches]
-        method = "from steps, as the cloth never hung still: at most this"
-    count = [len(xyz) for xyz in chosen]
-    direction = _noisiest(np.concatenate(chosen).reshape(-1, 3))
-    along = [_scatter(xyz @ np.column_stack([np.eye(3), direction])) for xyz in chosen]
-    x, y, z, std = np.sqrt(np.average(np.square(along), axis=0, weights=count)).tolist()
-    return Noise(std, (x, y, z), sum(count), method)
+        deviations = [np.diff(xyz, axis=0) / np.sqrt(2) for xyz in runs]
+        method = "from steps between frames, as the cloth was never at rest: an upper bound"
+    counts = [len(xyz) for xyz in deviations]
+    direction = _noisiest_direction(np.concatenate(deviations).reshape(-1, 3))
+    scatters = [_scatter(xyz @ np.column_stack([np.eye(3), direction])) for xyz in deviations]
+    x, y, z, std = np.sqrt(np.average(np.square(scatters), axis=0, weights=counts)).tolist()
+    return NoiseEstimate(std, (x, y, z), sum(counts), method)
 
 
-def of_clouds(clouds: PointClouds, still: np.ndarray | None) -> Noise | None:
-    """Robust scatter about quadrics through each point's neighbours, by preference in still frames (None: not known).
+def estimate_cloud_noise(clouds: PointClouds, still: np.ndarray | None) -> NoiseEstimate | None:
+    """Estimate cloud noise as the robust scatter about quadrics through each point's neighbours.
 
-    Wrinkles finer than a patch of 20 points count as noise: of a thinned cloud it is an upper bound.
+    Wrinkles finer than a patch of 20 points count as noise, so the result is an upper bound for thinned clouds.
+
+    Args:
+        clouds: the stream.
+        still: [T] bool, frames in which all grippers stand still, which are preferred; None: unknown.
+
+    Returns:
+        The noise along the surface's normal; None if no frame has enough points.
     """
-    big = np.flatnonzero(clouds.counts >= 2 * PATCH)
-    frames = big[:0] if still is None else np.intersect1d(np.flatnonzero(still), big)
-    where = "in still frames" if len(frames) else "in moving frames, as none is still"
-    where = "in all frames, as no gripper tells which are still" if still is None else where
-    frames = frames if len(frames) else big
+    large_enough = np.flatnonzero(clouds.counts >= 2 * PATCH_POINTS)
+    frames = large_enough[:0] if still is None else np.intersect1d(np.flatnonzero(still), large_enough)
+    frames_text = "in still frames" if len(frames) else "in moving frames, because none is still"
+    frames_text = "in all frames, because without grippers still frames are unknown" if still is None else frames_text
+    frames = frames if len(frames) else large_enough
     if len(frames) == 0:
         return None
-    frames = frames[np.unique(np.linspace(0, len(frames) - 1, FRAMES).astype(int))]
+    frames = frames[np.unique(np.linspace(0, len(frames) - 1, MAX_NOISE_FRAMES).astype(int))]
     residual = np.concatenate([_off_surface(clouds.frame(int(i))) for i in frames])
-    std = TO_SIGMA * float(np.median(np.abs(residual)))
-    return Noise(std, None, len(frames), f"off local surfaces of {PATCH} points, {where}")
+    std = MAD_TO_STD * float(np.median(np.abs(residual)))
+    return NoiseEstimate(std, None, len(frames), f"off local surfaces of {PATCH_POINTS} points, {frames_text}")
 
 
 def _off_surface(cloud: np.ndarray) -> np.ndarray:
-    """Distances of points from the quadric through their neighbours, scaled to what the sensor's own error is."""
-    cloud = cloud[:: len(cloud) // LARGE + 1]
-    centre = cloud[np.unique(np.linspace(0, len(cloud) - 1, QUERIES).astype(int))]
-    away = ((centre[:, None] - cloud) ** 2).sum(-1)
-    patch = cloud[np.argpartition(away, PATCH - 1, axis=1)[:, :PATCH]]
+    """Return the distances of points from the quadric through their neighbours, corrected for the fitted terms."""
+    cloud = cloud[:: len(cloud) // MAX_CLOUD_POINTS + 1]
+    centre = cloud[np.unique(np.linspace(0, len(cloud) - 1, MAX_PATCHES).astype(int))]
+    squared_distance = ((centre[:, None] - cloud) ** 2).sum(-1)
+    patch = cloud[np.argpartition(squared_distance, PATCH_POINTS - 1, axis=1)[:, :PATCH_POINTS]]
     patch = patch - patch.mean(1, keepdims=True)
     axes = np.linalg.svd(patch, full_matrices=False)[2]
     u, v, w = np.moveaxis(np.einsum("nkj,nij->nki", patch, axes), -1, 0)
@@ -99,26 +110,26 @@ def _off_surface(cloud: np.ndarray) -> np.ndarray:
     size = np.linalg.norm(basis, axis=1, keepdims=True)
     q, _ = np.linalg.qr(basis / np.where(size > 0, size, 1))
     residual = w - np.einsum("nki,nji,nj->nk", q, q, w)
-    return (residual * np.sqrt(PATCH / (PATCH - QUADRIC))).ravel()
+    return (residual * np.sqrt(PATCH_POINTS / (PATCH_POINTS - QUADRIC_COEFFICIENTS))).ravel()
 
 
 def _scatter(deviation: np.ndarray) -> np.ndarray:
-    """[D] robust standard deviation of [T, M, D] over the frames; the median over the markers."""
-    well = deviation[:, np.isfinite(deviation[..., 0]).sum(0) >= SHORTEST - 1]
-    if well.shape[1] == 0:
+    """Return [D] the robust standard deviation of [T, M, D] over the frames, median over the markers."""
+    seen_often = deviation[:, np.isfinite(deviation[..., 0]).sum(0) >= MIN_STILL_FRAMES - 1]
+    if seen_often.shape[1] == 0:
         return np.full(deviation.shape[-1], np.nan)
-    return TO_SIGMA * np.median(median(np.abs(well - median(well, 0)), 0), axis=0)
+    return MAD_TO_STD * np.median(nan_median(np.abs(seen_often - nan_median(seen_often, 0)), 0), axis=0)
 
 
-def _noisiest(deviation: np.ndarray) -> np.ndarray:
-    """Unit direction [3] in which [N, 3] scatter most, far ones pulled in."""
+def _noisiest_direction(deviation: np.ndarray) -> np.ndarray:
+    """Return the unit direction [3] in which deviations [N, 3] scatter most; outliers are shortened."""
     seen = deviation[np.isfinite(deviation[:, 0])]
     size = np.linalg.norm(seen, axis=1, keepdims=True)
     seen = seen * np.minimum(1, 3 * np.median(size) / np.maximum(size, 1e-12))
     return np.linalg.eigh(seen.T @ seen)[1][:, -1]
 
 
-def _stretches(still: np.ndarray) -> list[slice]:
-    """Runs of frames that are still."""
+def _still_runs(still: np.ndarray) -> list[slice]:
+    """Return the runs of still frames."""
     edges = np.flatnonzero(np.diff(np.concatenate([[False], still, [False]]).astype(int)))
     return [slice(a, b) for a, b in zip(edges[::2], edges[1::2], strict=True)]

@@ -1,4 +1,4 @@
-"""Numbers as colours, the same in every picture and viewer."""
+"""Map numbers to colours, in the same way for every picture and viewer."""
 
 from __future__ import annotations
 
@@ -8,18 +8,28 @@ import numpy as np
 
 from .geometry import Array
 
-UNKNOWN = (164, 168, 176)  # sRGB of what no measured point lies near
-MAP = "YlOrRd"
+UNKNOWN_COLOUR = (164, 168, 176)  # sRGB, where no value is known
+COLOUR_MAP_NAME = "YlOrRd"
+MIN_COLOUR_LIMIT_MM = 2.0  # smaller distances and errors would be dramatised
+COLOUR_LIMIT_QUANTILE = 0.95  # of the values, is dark red
 
 
-def colours(values: Array, worst: float) -> Array:
-    """sRGB uint8 [..., 3] of values >= 0, pale at 0 and dark red from ``worst`` on; grey where they are NaN."""
-    shown = colour_map()(np.clip(np.nan_to_num(values, nan=0.0) / worst, 0, 1), bytes=True)[..., :3]
-    return np.where(np.isnan(values)[..., None], np.array(UNKNOWN, np.uint8), shown)
+def map_colours(values: Array, colour_limit: float) -> Array:
+    """Map values >= 0 to sRGB colours: pale at 0, dark red from ``colour_limit`` on, grey for NaN.
+
+    Args:
+        values: [...].
+        colour_limit: value at the end of the colour bar.
+
+    Returns:
+        uint8 [..., 3].
+    """
+    shown = get_colour_map()(np.clip(np.nan_to_num(values, nan=0.0) / colour_limit, 0, 1), bytes=True)[..., :3]
+    return np.where(np.isnan(values)[..., None], np.array(UNKNOWN_COLOUR, np.uint8), shown)
 
 
-def colour_map(name: str = MAP) -> Any:
-    """One of matplotlib's maps, for a colour bar."""
+def get_colour_map(name: str = COLOUR_MAP_NAME) -> Any:
+    """Return a colour map of matplotlib by its name."""
     from matplotlib import colormaps
 
     return colormaps[name]

@@ -1,4 +1,4 @@
-"""A film as a GIF that plays in real time, or as a PNG of some of its moments. Needs matplotlib and pillow only."""
+"""Write a film as a GIF in real time, or as a PNG of some frames. Needs matplotlib and Pillow only."""
 
 from __future__ import annotations
 
@@ -11,117 +11,118 @@ import numpy as np
 from .._utils.files import write_atomically
 from ..errors import InvalidInput
 from .film import Film
-from .frame_renderer import Stage
+from .frame_renderer import FrameRenderer
 from .geometry import Array
 
-RATE, FASTEST = 25.0, 50.0  # 1/s; browsers slow a faster GIF down
-COLOURS = 96  # of a GIF
-LONGEST = 65535  # hundredths of a second, of a frame: what 16 bits hold
-GIF, MOMENT = (560, 420), (480, 420)  # pixels
-PANELS = 4  # moments on a PNG
+DEFAULT_GIF_RATE_HZ = 25.0
+MAX_GIF_RATE_HZ = 50.0  # browsers slow down a faster GIF
+GIF_COLOURS = 96
+MAX_GIF_FRAME_CS = 65535  # hundredths of a second, the largest 16-bit number
+GIF_SIZE_PX, PNG_PANEL_SIZE_PX = (560, 420), (480, 420)
+PNG_PANELS = 4
 
 
-def animate(
+def write_gif(
     film: Film,
     path: str | Path,
     *,
     size: tuple[int, int] | None = None,
-    rate: float = RATE,
+    rate: float = DEFAULT_GIF_RATE_HZ,
     look: tuple[float, float] | None = None,
     on_frame: Callable[[int, int], None] | None = None,
 ) -> Path:
-    """Write a film as a GIF, in real time.
+    """Write a film as a GIF that plays in real time.
 
     Args:
-        film: what to show, e.g. ``film_of(recording)``.
-        path: the file; it only ever holds a whole GIF.
+        film: what to show, e.g. ``film_from_recording(recording)``.
+        path: the file; it is written atomically.
         size: (width, height) pixels; None: 560 x 420.
-        rate: at most so many frames a second, up to 50.
-        look: (azimuth, elevation) degrees of the eye; None: chosen by the film.
-        on_frame: called with (frames done, frames in all).
+        rate: most frames per second, up to 50.
+        look: (azimuth, elevation) of the eye [degrees]; None: chosen from the film.
+        on_frame: called with (frames done, all frames).
 
     Returns:
         ``path``.
 
     Raises:
-        InvalidInput: a rate that no GIF has, or a size too small or too large.
+        InvalidInput: a rate that no GIF can have, or a size that is too small or too large.
     """
     from PIL import Image
 
-    check_rate(rate)
-    film = film.at_most(rate)
-    stage = Stage(film, size or GIF, look)
-    palette = _palette(stage)
+    check_gif_rate(rate)
+    film = film.limit_rate(rate)
+    renderer = FrameRenderer(film, size or GIF_SIZE_PX, look)
+    palette = _palette(renderer)
     images = []
     for frame in range(len(film)):
-        pixels = Image.fromarray(stage.pixels(frame))
+        pixels = Image.fromarray(renderer.pixels(frame))
         images.append(pixels.quantize(palette=palette, dither=Image.Dither.NONE))
         if on_frame is not None:
             on_frame(frame + 1, len(film))
     steps = _durations(film.times)
-    with write_atomically(Path(path)) as part:
+    with write_atomically(Path(path)) as file:
         images[0].save(
-            part, format="GIF", save_all=True, append_images=images[1:], duration=steps, loop=0, optimize=True
+            file, format="GIF", save_all=True, append_images=images[1:], duration=steps, loop=0, optimize=True
         )
     return Path(path)
 
 
-def check_rate(rate: float) -> None:
-    """Refuse a rate that no GIF has.
+def check_gif_rate(rate: float) -> None:
+    """Check that a GIF can have this rate [1/s].
 
     Raises:
-        InvalidInput: it is not above 0 and at most 50 frames a second.
+        InvalidInput: the rate is not above 0 or exceeds 50 frames per second.
     """
-    if not 0 < rate <= FASTEST:
-        raise InvalidInput("rate", got=rate, expected=f"up to {FASTEST:g} frames a second, what a GIF can hold")
+    if not 0 < rate <= MAX_GIF_RATE_HZ:
+        raise InvalidInput("rate", got=rate, expected=f"up to {MAX_GIF_RATE_HZ:g} frames a second, what a GIF can hold")
 
 
-def picture(
+def write_png(
     film: Film, path: str | Path, *, size: tuple[int, int] | None = None, look: tuple[float, float] | None = None
 ) -> Path:
-    """Write a PNG with four moments of the film, from the first frame to the last, side by side.
+    """Write a PNG with four frames of the film, from the first to the last, side by side.
 
-    The title is over the first, the colour bar beside the last.
+    The title is above the first frame, the colour bar beside the last.
 
     Args:
         film: what to show.
-        path: the file; it only ever holds a whole PNG.
-        size: (width, height) pixels of one moment with its colour bar; None: 480 x 420.
-        look: as of ``animate``.
+        path: the file; it is written atomically.
+        size: (width, height) pixels of one frame with its colour bar; None: 480 x 420.
+        look: see ``write_gif``.
 
     Returns:
         ``path``.
     """
     from PIL import Image
 
-    shown = np.unique(np.linspace(0, len(film) - 1, PANELS).round().astype(int))
-    stage = Stage(film, size or MOMENT, look)
-    moments = [stage.pixels(int(frame), titled=frame == shown[0]) for frame in shown]
-    row = np.concatenate([*(moment[:, : stage.scene] for moment in moments[:-1]), moments[-1]], axis=1)
-    with write_atomically(Path(path)) as part:
-        Image.fromarray(row).save(part, format="PNG", optimize=True)
+    shown = np.unique(np.linspace(0, len(film) - 1, PNG_PANELS).round().astype(int))
+    renderer = FrameRenderer(film, size or PNG_PANEL_SIZE_PX, look)
+    panels = [renderer.pixels(int(frame), titled=frame == shown[0]) for frame in shown]
+    row = np.concatenate([*(panel[:, : renderer.scene_width] for panel in panels[:-1]), panels[-1]], axis=1)
+    with write_atomically(Path(path)) as file:
+        Image.fromarray(row).save(file, format="PNG", optimize=True)
     return Path(path)
 
 
-def _palette(stage: Stage) -> Any:
-    """One palette for all frames, from three of them: the parts that do not move then cost nothing."""
+def _palette(renderer: FrameRenderer) -> Any:
+    """Return one palette for all frames, from three of them; parts that do not move then take no space."""
     from PIL import Image
 
-    shown = np.unique(np.linspace(0, len(stage.film) - 1, 3).round().astype(int))
-    together = np.concatenate([stage.pixels(int(frame)) for frame in shown])
-    return Image.fromarray(together).quantize(COLOURS, method=Image.Quantize.MAXCOVERAGE, dither=Image.Dither.NONE)
+    shown = np.unique(np.linspace(0, len(renderer.film) - 1, 3).round().astype(int))
+    samples = np.concatenate([renderer.pixels(int(frame)) for frame in shown])
+    return Image.fromarray(samples).quantize(GIF_COLOURS, method=Image.Quantize.MAXCOVERAGE, dither=Image.Dither.NONE)
 
 
 def _durations(times: Array) -> list[int]:
-    """Milliseconds of each frame, in the hundredths of a second that a GIF knows; their sum is right."""
+    """Return the duration of each frame [ms], rounded to the hundredths of a second of a GIF without accumulating."""
     if len(times) == 1:
         return [1000]
     ends = np.append(times[1:], 2 * times[-1] - times[-2]) - times[0]
     shown = [0]
     for end in np.round(100 * ends).astype(int).tolist():
-        shown.append(max(end, shown[-1] + 2))  # what one frame is too long, the next are shorter
-    if (longest := int(np.diff(shown).max())) > LONGEST:
-        expected = f"at most {LONGEST / 100:.0f} s, which a GIF can say"
+        shown.append(max(end, shown[-1] + 2))  # the next frames make up for a frame that is too long
+    if (longest := int(np.diff(shown).max())) > MAX_GIF_FRAME_CS:
+        expected = f"at most {MAX_GIF_FRAME_CS / 100:.0f} s, which a GIF can say"
         raise InvalidInput(
             "frames", got=f"{longest / 100:.0f} s between two", expected=expected, remedy=".png or .html"
         )

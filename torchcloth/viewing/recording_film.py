@@ -1,4 +1,4 @@
-"""A recording as a film."""
+"""Film of a recording."""
 
 from __future__ import annotations
 
@@ -9,45 +9,46 @@ import torch
 
 from ..boundaries.motion import interpolate_poses
 from ..errors import InvalidInput, RecordingError, TorchclothError
-from ..observe import DepthCamera, decode, solid_mesh, to_points
+from ..observe import DepthCamera, build_solid_mesh, decode_depth, to_points
 from ..recordings import Collider, Recording
 from ..robots import arm_from_recording, replay  # pyright: ignore[reportMissingImports] - mapped from robots/ at installation
 from ..robots.replay import unwrap_joints  # pyright: ignore[reportMissingImports]
 from ..types import Trajectory
 from .film import (
-    MARKERS,
-    TRUTH,
+    MARKER_COLOUR,
+    TRUTH_COLOUR,
+    CameraView,
+    ClothSurface,
     Cloud,
     Curve,
     Film,
-    Plane,
-    Sheet,
-    Solid,
-    Trace,
-    View,
+    GripperPath,
+    GroundPlane,
+    RigidBody,
 )
-from .geometry import Array, nearest
+from .geometry import Array, nearest_indices
 
-RATE = 25.0  # 1/s, frames of an episode that was not observed
-MARGIN = 0.3  # m, by which a collider's plane is drawn beyond what lies over it
-FROM_DEPTH = 4000  # points of a depth image that are shown at most
-SLACK = 0.5  # of the time between two frames of the slower stream: what was seen farther away is not shown
+FILM_RATE_HZ = 25.0  # of episodes without observations
+PLANE_MARGIN_M = 0.3  # a collider's plane is drawn this far beyond what lies over it
+MAX_DEPTH_POINTS = 4000  # shown of one depth image
+MAX_TIME_OFFSET_FRAMES = 0.5  # frame periods of the slower stream; observations farther away are not shown
 
 
-def film_of(recording: Recording, *, truth: bool = False, times: Array | None = None) -> Film:
-    """What an episode holds: points, markers, arms, grippers' paths, colliders, cameras, forces.
+def film_from_recording(recording: Recording, *, truth: bool = False, times: Array | None = None) -> Film:
+    """Make a film of an episode: points, markers, arms, gripper paths, colliders, cameras and forces.
 
-    A stream that was not recorded is not shown. Depth images are shown as points where there are no other points, and
-    no markers: within their masks where there are some.
+    Streams that were not recorded are not shown. Without points and markers, depth images are shown as points, within
+    their masks if there are any.
 
     Args:
         recording: an episode.
-        truth: show the true cloth of a synthetic episode too (read it with ``with_truth=True``).
-        times: [T] s on the motion clock; None: those of the points, else of markers, images or truth, else 25 a second.
+        truth: also show the true cloth of a synthetic episode (read it with ``with_truth=True``).
+        times: [T] s on the motion clock; None: those of the points, else of markers, images or truth, else 25 per
+            second.
 
     Raises:
-        RecordingError: truth was asked for and is not there, or nothing in the episode has a time.
-        MissingDependency: the kinematics' packages are not installed and the episode has joints.
+        RecordingError: the truth is requested and missing, or nothing in the episode has a time.
+        MissingDependency: the episode has joints, and the packages of the kinematics are not installed.
     """
     if truth:
         recording.require("truth", by="--truth")
@@ -57,8 +58,8 @@ def film_of(recording: Recording, *, truth: bool = False, times: Array | None = 
         paths = {**replay(replace(recording, joints={})), **paths}
     clouds, views = _clouds(recording, times), _views(recording, times)
     if not clouds:
-        clouds, more = _depths(recording, views, times)
-        notes += more
+        clouds, depth_notes = _depth_clouds(recording, views, times)
+        notes += depth_notes
     film = Film(
         title=recording.path.name if recording.path else "recording",
         times=times,
@@ -70,12 +71,12 @@ def film_of(recording: Recording, *, truth: bool = False, times: Array | None = 
         curves=_curves(recording),
         notes=tuple(notes),
     )
-    planes = {f"colliders/{name}": _plane(c, film.box) for name, c in recording.colliders.items()}
+    planes = {f"colliders/{name}": _plane(c, film.bounds) for name, c in recording.colliders.items()}
     return replace(film, planes=planes)
 
 
 def _times(recording: Recording, truth: bool) -> Array:
-    """On the motion clock; observations are brought to it."""
+    """Return the times [T] s of the observations on the motion clock, or others if there are none."""
     offset = recording.clock_offset
     for stream in (recording.points, recording.markers):
         if stream is not None:
@@ -90,31 +91,37 @@ def _times(recording: Recording, truth: bool) -> Array:
     if not motions:
         raise RecordingError(f"{recording.path}: nothing to view", expected="points, markers, images or motion")
     start, end = min(m.t[0] for m in motions), max(m.t[-1] for m in motions)
-    return np.linspace(start, end, max(2, round((end - start) * RATE) + 1)) if end > start else np.array([start])
+    return (
+        np.linspace(start, end, max(2, round((end - start) * FILM_RATE_HZ) + 1)) if end > start else np.array([start])
+    )
 
 
-def _seen(stream_times: Array, times: Array) -> Array:
-    """[T] which entry of an observed stream belongs to each frame; -1 where none is near."""
-    index = nearest(stream_times, times)
-    gap = SLACK * max((float(np.median(np.diff(t))) for t in (stream_times, times) if len(t) > 1), default=0.0)
+def _nearest_entries(stream_times: Array, times: Array) -> Array:
+    """Return [T] the entry of an observed stream that belongs to each frame; -1 if none is near."""
+    index = nearest_indices(stream_times, times)
+    gap = MAX_TIME_OFFSET_FRAMES * max(
+        (float(np.median(np.diff(t))) for t in (stream_times, times) if len(t) > 1), default=0.0
+    )
     return np.where(np.abs(stream_times[index] - times) <= gap * (1 + 1e-6) + 1e-9, index, -1)
 
 
 def _clouds(recording: Recording, times: Array) -> dict[str, Cloud]:
-    out, nothing = {}, np.zeros((0, 3), np.float32)
+    out, no_points = {}, np.zeros((0, 3), np.float32)
     if (points := recording.points) is not None:
-        index = _seen(points.t + recording.clock_offset, times)
+        index = _nearest_entries(points.t + recording.clock_offset, times)
         cuts = np.split(points.xyz.astype(np.float32), np.cumsum(points.counts)[:-1])
-        out["points"] = Cloud(tuple(nothing if i < 0 else cuts[i] for i in index))
+        out["points"] = Cloud(tuple(no_points if i < 0 else cuts[i] for i in index))
     if (markers := recording.markers) is not None:
-        index = _seen(markers.t + recording.clock_offset, times)
-        rows = [nothing if i < 0 else markers.xyz[i].astype(np.float32) for i in index]
-        out["markers"] = Cloud(tuple(row[np.isfinite(row).all(axis=-1)] for row in rows), MARKERS)
+        index = _nearest_entries(markers.t + recording.clock_offset, times)
+        rows = [no_points if i < 0 else markers.xyz[i].astype(np.float32) for i in index]
+        out["markers"] = Cloud(tuple(row[np.isfinite(row).all(axis=-1)] for row in rows), MARKER_COLOUR)
     return out
 
 
-def _depths(recording: Recording, views: dict[str, View], times: Array) -> tuple[dict[str, Cloud], list[str]]:
-    """What the depth images of each camera show; what is not drawn, and why."""
+def _depth_clouds(
+    recording: Recording, views: dict[str, CameraView], times: Array
+) -> tuple[dict[str, Cloud], list[str]]:
+    """Return the points of each camera's depth images, and notes on images that are not drawn."""
     clouds, notes = {}, []
     for name, view in views.items():
         try:
@@ -123,98 +130,98 @@ def _depths(recording: Recording, views: dict[str, View], times: Array) -> tuple
             notes.append(f"depth of {name!r} is not drawn: {error}")
             continue
         if view.camera.depth is not None and (scale := view.camera.depth_scale) is not None:
-            clouds[f"depth/{name}"] = _from_depth(view, camera, scale, times)
+            clouds[f"depth/{name}"] = _depth_cloud(view, camera, scale, times)
     if not clouds:
         images = any(v.camera.depth or v.camera.color or v.camera.mask for v in views.values())
-        found = "images are not drawn" if images else "no images"
-        notes.append(f"nothing that was seen of the cloth is drawn: no points, no markers, {found}")
+        images_note = "images are not drawn" if images else "no images"
+        notes.append(f"no observation of the cloth is drawn: no points, no markers, {images_note}")
     return clouds, notes
 
 
-def _from_depth(view: View, camera: DepthCamera, scale: float, times: Array) -> Cloud:
-    """A camera's depth images as points, thinned."""
+def _depth_cloud(view: CameraView, camera: DepthCamera, scale: float, times: Array) -> Cloud:
+    """Return a camera's depth images as thinned point clouds."""
     depth, mask, frames = view.camera.depth, view.camera.mask, []
-    place = {} if mask is None else {number: k for k, number in enumerate(mask.frames.tolist())}
+    mask_rows = {} if mask is None else {number: k for k, number in enumerate(mask.frames.tolist())}
     for frame in range(len(times)):
-        raw = view.raw(frame)
-        if raw is None or depth is None:
+        depth_image = view.depth_image(frame)
+        if depth_image is None or depth is None:
             frames.append(np.zeros((0, 3), np.float32))
             continue
-        own = place.get(int(depth.frames[view.index[frame]]))  # another image's would cut off what has moved
-        inside = None if own is None or mask is None else mask.load(own) > 0
-        points = to_points(camera, decode(raw, scale), inside)
-        frames.append(points[:: max(1, -(-len(points) // FROM_DEPTH))].astype(np.float32))
+        row = mask_rows.get(int(depth.frames[view.index[frame]]))  # the cloth has moved since any other mask
+        inside = None if row is None or mask is None else mask.load(row) > 0
+        points = to_points(camera, decode_depth(depth_image, scale), inside)
+        frames.append(points[:: max(1, -(-len(points) // MAX_DEPTH_POINTS))].astype(np.float32))
     return Cloud(tuple(frames))
 
 
-def _truth(recording: Recording, times: Array) -> Sheet:
-    """The true vertices, linear between their times."""
-    found = recording.require("truth", by="--truth")
-    right = np.clip(np.searchsorted(found.t, times), 1, max(1, len(found.t) - 1))
-    left, right = right - 1, np.minimum(right, len(found.t) - 1)
-    share = np.clip((times - found.t[left]) / np.maximum(found.t[right] - found.t[left], 1e-12), 0, 1)[:, None, None]
-    x = (1 - share) * found.vertices[left] + share * found.vertices[right]
-    return Sheet(x.astype(np.float32), found.faces, colour=TRUTH)
+def _truth(recording: Recording, times: Array) -> ClothSurface:
+    """Return the true vertices, interpolated linearly between their times."""
+    truth = recording.require("truth", by="--truth")
+    right = np.clip(np.searchsorted(truth.t, times), 1, max(1, len(truth.t) - 1))
+    left, right = right - 1, np.minimum(right, len(truth.t) - 1)
+    share = np.clip((times - truth.t[left]) / np.maximum(truth.t[right] - truth.t[left], 1e-12), 0, 1)[:, None, None]
+    x = (1 - share) * truth.vertices[left] + share * truth.vertices[right]
+    return ClothSurface(x.astype(np.float32), truth.faces, colour=TRUTH_COLOUR)
 
 
-def _arms(recording: Recording, times: Array) -> tuple[dict[str, Solid], dict[str, Trajectory], list[str]]:
-    """The solids and the gripper's path of every arm whose joints were recorded; why others are not drawn."""
+def _arms(recording: Recording, times: Array) -> tuple[dict[str, RigidBody], dict[str, Trajectory], list[str]]:
+    """Return the bodies and the gripper path of each arm with recorded joints, and notes on arms not drawn."""
     solids, paths, notes = {}, {}, []
     for name, motion in recording.joints.items():
         try:
             arm = arm_from_recording(recording, name)
-            q = np.stack([np.interp(times, motion.t, own) for own in unwrap_joints(arm, motion.q).T], axis=-1)
+            q = np.stack([np.interp(times, motion.t, column) for column in unwrap_joints(arm, motion.q).T], axis=-1)
             shapes = arm.geometry(torch.as_tensor(q, dtype=arm.base.dtype))
             paths |= replay(replace(recording, grippers={}, joints={name: motion}))
-            if arm.links_without_primitives:
-                notes.append(f"of arm {name!r} links that are meshes alone are not drawn: {', '.join(arm.links_without_primitives)}")
+            if links := arm.links_without_primitives:
+                notes.append(f"arm {name!r}: links that are given as meshes alone are not drawn: {', '.join(links)}")
         except ImportError:
             raise
         except TorchclothError as error:
             notes.append(f"arm {name!r} is not drawn: {error}")
             continue
         for number, shape in enumerate(shapes):
-            vertices, faces = solid_mesh(shape.kind, shape.size, np.eye(4), segments=16)
-            solids[f"arms/{name}/{number}-{shape.link}"] = Solid(vertices, faces, _poses(shape.pose, len(times)))
+            vertices, faces = build_solid_mesh(shape.kind, shape.size, np.eye(4), segments=16)
+            solids[f"arms/{name}/{number}-{shape.link}"] = RigidBody(vertices, faces, _poses(shape.pose, len(times)))
     return solids, paths, notes
 
 
 def _poses(pose: torch.Tensor, count: int) -> Array:
-    """[T, 4, 4], or [1, 4, 4] of what never moves."""
+    """Return poses [T, 4, 4], or [1, 4, 4] of a body that never moves."""
     poses = np.broadcast_to(pose.detach().numpy(), (count, 4, 4))
     return poses[:1] if np.allclose(poses, poses[0], rtol=0, atol=1e-9) else poses
 
 
-def _trace(path: Trajectory, times: Array) -> Trace:
+def _trace(path: Trajectory, times: Array) -> GripperPath:
     inside = np.clip(times, float(path.t[0]), float(path.t[-1]))
     poses = interpolate_poses(path, torch.as_tensor(inside))
-    return Trace(path.pose[:, :3, 3].numpy(), poses.numpy())
+    return GripperPath(path.pose[:, :3, 3].numpy(), poses.numpy())
 
 
-def _plane(collider: Collider, box: tuple[Array, Array]) -> Plane:
-    """A square of a collider's surface under everything."""
-    low, high = box
+def _plane(collider: Collider, bounds: tuple[Array, Array]) -> GroundPlane:
+    """Return a square of a collider's surface that extends under the whole scene."""
+    low, high = bounds
     normal = collider.normal / np.linalg.norm(collider.normal)
     middle = (low + high) / 2
     centre = middle - ((middle - collider.point) @ normal) * normal
     first = np.cross(np.eye(3)[np.argmin(np.abs(normal))], normal)
     first /= np.linalg.norm(first)
-    axes = (float(np.linalg.norm(high - low)) / 2 + MARGIN) * np.stack([first, np.cross(normal, first)])
-    return Plane(centre + np.array([[-1.0, -1], [1, -1], [1, 1], [-1, 1]]) @ axes)
+    axes = (float(np.linalg.norm(high - low)) / 2 + PLANE_MARGIN_M) * np.stack([first, np.cross(normal, first)])
+    return GroundPlane(centre + np.array([[-1.0, -1], [1, -1], [1, 1], [-1, 1]]) @ axes)
 
 
-def _views(recording: Recording, times: Array) -> dict[str, View]:
+def _views(recording: Recording, times: Array) -> dict[str, CameraView]:
     out = {}
     for name, camera in recording.cameras.items():
         index = np.full(len(times), -1)
         if camera.depth is not None and camera.depth_scale is not None:
-            index = _seen(camera.depth.t + recording.clock_offset, times)
-        out[name] = View(camera, index)
+            index = _nearest_entries(camera.depth.t + recording.clock_offset, times)
+        out[name] = CameraView(camera, index)
     return out
 
 
 def _curves(recording: Recording) -> dict[str, Curve]:
-    """Size of each measured gripper force."""
+    """Return the magnitude of each measured gripper force over time."""
     out = {}
     for name, motion in {**recording.joints, **recording.grippers}.items():
         if motion.force is not None:

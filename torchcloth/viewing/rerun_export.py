@@ -1,4 +1,4 @@
-"""A film as a file for rerun's viewer (``rerun FILE.rrd``)."""
+"""Write a film as a file for rerun's viewer (``rerun FILE.rrd``)."""
 
 from __future__ import annotations
 
@@ -10,30 +10,30 @@ import numpy as np
 from .._utils.files import write_atomically
 from ..errors import MissingDependency
 from ..meshes.mesh import vertex_normals
-from ..observe import DepthCamera, decode, encode, reproject
-from ..observe.render import open3d_or_refuse
-from .colours import colours
-from .film import Film, Solid, Trace, View
-from .geometry import Array, quaternions
-from .projection import camera_for
+from ..observe import DepthCamera, decode_depth, encode_depth, reproject
+from ..observe.render import import_open3d
+from .colours import map_colours
+from .film import GRIPPER_AXES_LENGTH_M, CameraView, Film, GripperPath, RigidBody
+from .geometry import Array, to_quaternions
+from .projection import fit_camera
 
-TIME = "time"  # the timeline, s on the motion clock
-WORLD, CURVES = "world", "curves"
-DOT = 0.0025  # m, radius of a point
-LINE = 0.0015  # m, radius of a gripper's path
-AXES = 0.05  # m, length of a gripper's axes
-IMAGE_PLANE = 0.15  # m, of a camera's frustum
-WINDOW, NEARER = (800, 600), 0.5  # pixels; its lens is wider than that of pictures, so the eye comes nearer
+TIMELINE = "seconds from the first frame"
+WORLD_ENTITY, CURVES_ENTITY = "world", "curves"
+POINT_RADIUS_M = 0.0025
+PATH_RADIUS_M = 0.0015
+IMAGE_PLANE_DISTANCE_M = 0.15  # of a camera's frustum
+RERUN_VIEW_SIZE_PX = (800, 600)
+EYE_DISTANCE_FACTOR = 0.5  # rerun's lens is wider than that of pictures, so the eye must be nearer
 
 
 def write_rrd(film: Film, path: str | Path) -> Path:
-    """Write a film for rerun's viewer: shapes in the world, curves, depth images, on the timeline "time".
+    """Write a film for rerun's viewer: shapes, curves and depth images on the timeline "seconds from the first frame".
 
-    Depth images of a distorted lens are written as an ideal lens would have taken them.
+    Depth images of a distorted lens are resampled to an ideal lens.
 
     Args:
         film: what to show.
-        path: the file; it only ever holds a whole recording.
+        path: the file; it is written atomically.
 
     Returns:
         ``path``.
@@ -43,11 +43,11 @@ def write_rrd(film: Film, path: str | Path) -> Path:
     """
     rr = _rerun()
     with write_atomically(Path(path)) as part:
-        part.touch()  # where nothing can be written, rerun's own error would not say which file
+        part.touch()  # rerun's own error for an unwritable path does not name the file
         stream = rr.RecordingStream("torchcloth")
         stream.save(part, default_blueprint=_layout(film))
         stream.send_recording_name(film.title)
-        stream.log(WORLD, rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
+        stream.log(WORLD_ENTITY, rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
         _Writer(rr, stream, film).write()
         stream.flush()
         stream.disconnect()
@@ -55,7 +55,7 @@ def write_rrd(film: Film, path: str | Path) -> Path:
 
 
 class _Writer:
-    """Sends each kind of part in columns: one message for all frames."""
+    """Sends each part in columns, with one message for all frames."""
 
     def __init__(self, rr: Any, stream: Any, film: Film) -> None:
         self.rr, self.stream, self.film = rr, stream, film
@@ -65,7 +65,7 @@ class _Writer:
         for name in film.sheets:
             self._sheet(name)
         for name, cloud in film.clouds.items():
-            self._static(name, rr.Points3D.from_fields(colors=[cloud.colour], radii=[DOT]))
+            self._static(name, rr.Points3D.from_fields(colors=[cloud.colour], radii=[POINT_RADIUS_M]))
             lengths = [len(points) for points in cloud.frames]
             self._columns(name, rr.Points3D.columns(positions=np.concatenate(cloud.frames)).partition(lengths))
         for name, solid in film.solids.items():
@@ -78,19 +78,23 @@ class _Writer:
             self._view(name, view)
         for name, curve in film.curves.items():
             known = np.isfinite(curve.values)
-            times = rr.TimeColumn(TIME, duration=curve.t[known])
-            self.stream.send_columns(self._path(CURVES, name), [times], rr.Scalars.columns(scalars=curve.values[known]))
-            self.stream.log(self._path(CURVES, name), rr.SeriesLines(names=f"{name} [{curve.unit}]"), static=True)
+            times = rr.TimeColumn(TIMELINE, duration=curve.t[known] - film.times[0])
+            self.stream.send_columns(
+                self._path(CURVES_ENTITY, name), [times], rr.Scalars.columns(scalars=curve.values[known])
+            )
+            self.stream.log(
+                self._path(CURVES_ENTITY, name), rr.SeriesLines(names=f"{name} [{curve.unit}]"), static=True
+            )
 
     def _path(self, root: str, name: str) -> str:
         return self.rr.new_entity_path([root, *name.split("/")])
 
-    def _static(self, name: str, what: Any) -> None:
-        self.stream.log(self._path(WORLD, name), what, static=True)
+    def _static(self, name: str, component: Any) -> None:
+        self.stream.log(self._path(WORLD_ENTITY, name), component, static=True)
 
     def _columns(self, name: str, columns: Any) -> None:
-        times = self.rr.TimeColumn(TIME, duration=self.film.times)
-        self.stream.send_columns(self._path(WORLD, name), [times], columns)
+        times = self.rr.TimeColumn(TIMELINE, duration=self.film.times - self.film.times[0])
+        self.stream.send_columns(self._path(WORLD_ENTITY, name), [times], columns)
 
     def _sheet(self, name: str) -> None:
         sheet, count = self.film.sheets[name], len(self.film)
@@ -100,14 +104,14 @@ class _Writer:
             fixed = self.rr.Mesh3D.from_fields(triangle_indices=sheet.faces, albedo_factor=sheet.colour)
             normals = np.stack([vertex_normals(frame, sheet.faces) for frame in x])
             fields["vertex_normals"] = normals.astype(np.float32).reshape(-1, 3)
-        else:  # without normals it is not shaded, and its colours are those of the scale
+        else:  # without normals the mesh is not shaded, so its colours match the colour bar
             fixed = self.rr.Mesh3D.from_fields(triangle_indices=sheet.faces)
-            fields["vertex_colors"] = colours(sheet.values, self.film.worst).reshape(-1, 3)
+            fields["vertex_colors"] = map_colours(sheet.values, self.film.colour_limit).reshape(-1, 3)
         self._static(name, fixed)
         self._columns(name, self.rr.Mesh3D.columns(**fields).partition([x.shape[1]] * count))
 
     def _mesh(self, name: str, vertices: Array, faces: Array, colour: tuple[int, int, int]) -> None:
-        flat = vertices[faces].reshape(-1, 3)  # corners of their own: edges stay sharp
+        flat = vertices[faces].reshape(-1, 3)  # separate corners for each triangle keep edges sharp
         index = np.arange(len(flat)).reshape(-1, 3)
         normals = vertex_normals(flat, index)
         self._static(
@@ -115,80 +119,89 @@ class _Writer:
             self.rr.Mesh3D(vertex_positions=flat, triangle_indices=index, vertex_normals=normals, albedo_factor=colour),
         )
 
-    def _solid(self, name: str, solid: Solid) -> None:
+    def _solid(self, name: str, solid: RigidBody) -> None:
         self._mesh(name, solid.vertices, solid.faces, solid.colour)
         self._poses(name, solid.poses)
 
     def _poses(self, name: str, poses: Array) -> None:
-        """Quaternions are xyzw in rerun."""
-        turned = quaternions(poses[:, :3, :3])[:, [1, 2, 3, 0]]
+        """Send poses; rerun's quaternions are xyzw."""
+        xyzw = to_quaternions(poses[:, :3, :3])[:, [1, 2, 3, 0]]
         if len(poses) == len(self.film):
-            self._columns(name, self.rr.Transform3D.columns(translation=poses[:, :3, 3], quaternion=turned))
+            self._columns(name, self.rr.Transform3D.columns(translation=poses[:, :3, 3], quaternion=xyzw))
         else:
-            self._static(name, self.rr.Transform3D(translation=poses[0, :3, 3], quaternion=turned[0]))
+            self._static(name, self.rr.Transform3D(translation=poses[0, :3, 3], quaternion=xyzw[0]))
 
-    def _trace(self, name: str, trace: Trace) -> None:
-        self._static(name, self.rr.LineStrips3D([trace.points], colors=[trace.colour], radii=[LINE]))
-        self._static(f"{name}/now", self.rr.TransformAxes3D(AXES))
+    def _trace(self, name: str, trace: GripperPath) -> None:
+        self._static(name, self.rr.LineStrips3D([trace.points], colors=[trace.colour], radii=[PATH_RADIUS_M]))
+        self._static(f"{name}/now", self.rr.TransformAxes3D(GRIPPER_AXES_LENGTH_M))
         self._poses(f"{name}/now", trace.poses)
 
-    def _view(self, name: str, view: View) -> None:
-        camera, rr, taken = view.camera, self.rr, DepthCamera.of(view.camera)
+    def _view(self, name: str, view: CameraView) -> None:
+        camera, rr, lens_camera = view.camera, self.rr, DepthCamera.from_recording(view.camera)
         self._poses(name, camera.T_world_camera[None])
-        straight = taken.lens.plain or not (view.index >= 0).any() or _rays_can_be_cast()
-        if straight:  # rerun knows no other lens
+        can_place = lens_camera.lens.is_identity or not (view.index >= 0).any() or _can_undistort()
+        if can_place:  # rerun supports only the pinhole model
             pinhole = rr.Pinhole(
                 image_from_camera=camera.K,
                 resolution=[camera.width, camera.height],
                 camera_xyz=rr.ViewCoordinates.RDF,
-                image_plane_distance=IMAGE_PLANE,
+                image_plane_distance=IMAGE_PLANE_DISTANCE_M,
             )
             self._static(name, pinhole)
         scale = float(camera.depth_scale or 1)
-        for frame, time in enumerate(self.film.times):
-            raw = view.raw(frame)
-            if raw is not None:
-                if straight and not taken.lens.plain:
-                    raw = encode(reproject(decode(raw, scale), taken, taken.rectified()), scale)
-                self.stream.set_time(TIME, duration=float(time))
-                self.stream.log(self._path(WORLD, f"{name}/depth"), rr.DepthImage(raw, meter=1.0 / scale))
+        for frame in range(len(self.film)):
+            depth_image = view.depth_image(frame)
+            if depth_image is not None:
+                if can_place and not lens_camera.lens.is_identity:
+                    depth_image = encode_depth(
+                        reproject(decode_depth(depth_image, scale), lens_camera, lens_camera.without_distortion()),
+                        scale,
+                    )
+                self.stream.set_time(TIMELINE, duration=self.film.seconds(frame))
+                self.stream.log(
+                    self._path(WORLD_ENTITY, f"{name}/depth"), rr.DepthImage(depth_image, meter=1.0 / scale)
+                )
 
 
-def _rays_can_be_cast() -> bool:
-    """Whether a lens can be taken out; images of a distorted one are else shown as they are, and placed nowhere."""
+def _can_undistort() -> bool:
+    """Whether distortion can be removed; otherwise images of a distorted lens are shown as they are, without a pose."""
     try:
-        open3d_or_refuse()
+        import_open3d()
     except MissingDependency:
         return False
     return True
 
 
 def _layout(film: Film) -> Any:
-    """The scene from where pictures are taken, depth images beside it, curves below, one plot for each quantity.
+    """Lay out the scene, depth images beside it, and below one plot for each quantity.
 
-    Sheets that others show as nets and the points of depth images would hide the rest: they are off at first.
+    Cloths that other viewers show as outlines, and the points of depth images, are hidden at first, because they would
+    cover the rest.
     """
     import rerun.blueprint as rrb
 
-    low, high = film.box
+    low, high = film.bounds
     target = (low + high) / 2
-    position = target + NEARER * (camera_for(film, WINDOW).T_world_camera[:3, 3] - target)
-    deep = [name for name, view in film.views.items() if (view.index >= 0).any()]
-    hidden = [*(name for name, sheet in film.sheets.items() if sheet.net), *(f"{name}/depth" for name in deep)]
-    shown: Any = rrb.Spatial3DView(
-        origin=f"/{WORLD}",
+    position = target + EYE_DISTANCE_FACTOR * (fit_camera(film, RERUN_VIEW_SIZE_PX).T_world_camera[:3, 3] - target)
+    depth_cameras = [name for name, view in film.views.items() if (view.index >= 0).any()]
+    hidden = [
+        *(name for name, sheet in film.sheets.items() if sheet.outline),
+        *(f"{name}/depth" for name in depth_cameras),
+    ]
+    layout: Any = rrb.Spatial3DView(
+        origin=f"/{WORLD_ENTITY}",
         name=film.title,
         eye_controls=rrb.EyeControls3D(position=position, look_target=target, eye_up=(0.0, 0.0, 1.0)),
-        overrides={f"/{WORLD}/{name}": rrb.EntityBehavior(visible=False) for name in hidden},
+        overrides={f"/{WORLD_ENTITY}/{name}": rrb.EntityBehavior(visible=False) for name in hidden},
     )
-    if deep:
-        images = (rrb.Spatial2DView(origin=f"/{WORLD}/{name}", name=name) for name in deep)
-        shown = rrb.Horizontal(shown, rrb.Vertical(*images), column_shares=[3, 1])
+    if depth_cameras:
+        images = (rrb.Spatial2DView(origin=f"/{WORLD_ENTITY}/{name}", name=name) for name in depth_cameras)
+        layout = rrb.Horizontal(layout, rrb.Vertical(*images), column_shares=[3, 1])
     if film.curves:
         quantities = dict.fromkeys(name.split("/")[0] for name in film.curves)
-        plots = (rrb.TimeSeriesView(origin=f"/{CURVES}/{name}", name=name) for name in quantities)
-        shown = rrb.Vertical(shown, rrb.Horizontal(*plots), row_shares=[3, 1])
-    return rrb.Blueprint(shown, collapse_panels=True)
+        plots = (rrb.TimeSeriesView(origin=f"/{CURVES_ENTITY}/{name}", name=name) for name in quantities)
+        layout = rrb.Vertical(layout, rrb.Horizontal(*plots), row_shares=[3, 1])
+    return rrb.Blueprint(layout, collapse_panels=True)
 
 
 def _rerun() -> Any:

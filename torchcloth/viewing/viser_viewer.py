@@ -1,4 +1,4 @@
-"""A film in a browser: a server with a time slider, or a file that plays by itself."""
+"""Show a film in a browser, from a server with a time slider or from a file that plays by itself."""
 
 from __future__ import annotations
 
@@ -14,31 +14,32 @@ from typing import Any
 import numpy as np
 
 from .._utils.files import write_atomically
-from .colours import colour_map, colours
-from .film import DISTANCE, Film, View
+from .colours import get_colour_map, map_colours
+from .film import DISTANCE_CURVE, CameraView, Film
 from .geometry import Array
-from .projection import camera_for
-from .viser_scene import ViserScene, viser
+from .projection import fit_camera
+from .viser_scene import ViserScene, import_viser
 
-HOST = "127.0.0.1"  # only this machine; `ssh -L` brings it elsewhere
-SPEEDS = (0.1, 2.0)  # times real time
-FASTEST = 60.0  # frames a second that are sent
-LONGEST = 60.0  # s, for one frame; only a server that was stopped meanwhile takes so long
-REST = 0.5  # s, before the film starts anew
-WINDOW = (480, 720)  # pixels, of the part of a browser's window that the panel leaves free
-DEPTH_SIZE, DEPTH_FAR = 320, 0.98  # pixels; quantile of the depths that has the last colour
-DEPTH_MAP = "viridis"
+SERVER_HOST = "127.0.0.1"  # this machine only; use `ssh -L` to reach it from another
+SPEED_RANGE = (0.1, 2.0)  # times real time
+MAX_SENT_RATE_HZ = 60.0  # of frames
+SERVER_TIMEOUT_S = 60.0  # for one frame; only a server that is stopped meanwhile takes so long
+END_PAUSE_S = 0.5  # before the film starts again
+BROWSER_VIEW_SIZE_PX = (480, 720)  # part of a browser's window that the panel leaves free
+DEPTH_IMAGE_WIDTH_PX = 320
+DEPTH_COLOUR_QUANTILE = 0.98  # of the depths, has the last colour
+DEPTH_COLOUR_MAP = "viridis"
 
 
 class Viewer:
-    """A film on a server of its own, with slider, play, speed, and groups to switch.
+    """Server that shows a film, with a time slider, play, speed, and groups to show or hide.
 
     Args:
         film: what to show.
-        port: of the server; when it is taken, the next free one.
+        port: of the server; the next free one is used if it is taken.
 
     Attributes:
-        port: where the server listens.
+        port: on which the server listens.
 
     Raises:
         MissingDependency: viser is not installed.
@@ -49,25 +50,25 @@ class Viewer:
         self.server = _server(film, port)
         self.port: int = self.server.get_port()
         self._closing = threading.Event()
-        self._inside(self._build)
+        self._run_on_server(self._build)
 
     def show(self, frame: int) -> None:
         """Show a frame; the slider follows."""
-        self._inside(lambda: self._show(frame))
+        self._run_on_server(lambda: self._show(frame))
 
     def _build(self) -> None:
-        _aim(self.server, self.film)
+        _set_camera(self.server, self.film)
         self.scene = ViserScene(self.film, self.server)
-        self._play_controls()
-        self._layers()
-        self._readings()
+        self._add_play_controls()
+        self._add_group_switches()
+        self._add_readings()
         self._show(0)
 
     def _show(self, frame: int) -> None:
         self.frame = frame
         with self.server.atomic():
             self.scene.show(frame)
-            self._clock.content = _words(self.film, frame)
+            self._status.content = _status_text(self.film, frame)
             for view, image in self._images:
                 pixels = _depth_picture(view, frame)
                 image.visible = pixels is not None
@@ -75,71 +76,75 @@ class Viewer:
                     image.image = pixels
             self.slider.value = frame
 
-    def _inside(self, act: Callable[[], None]) -> None:
-        """Do something in the server's own thread.
+    def _run_on_server(self, action: Callable[[], None]) -> None:
+        """Run an action in the server's own thread.
 
-        Elsewhere viser 1.1 now and then fails with "deque mutated during iteration": whoever sends a message wakes the
-        senders of all clients, which only their own thread may do.
+        From another thread viser 1.1 sometimes fails with "deque mutated during iteration": sending a message wakes
+        the senders of all clients, which only their own thread may do.
         """
         loop = self.server.get_event_loop()
 
-        async def acted() -> None:
-            act()
+        async def run_action() -> None:
+            action()
 
         if _running_loop() is loop:
-            act()
+            action()
         elif not self._closing.is_set():
-            asyncio.run_coroutine_threadsafe(acted(), loop).result(LONGEST)
+            asyncio.run_coroutine_threadsafe(run_action(), loop).result(SERVER_TIMEOUT_S)
 
     def run(self) -> None:
-        """Play, until ``stop`` is called or the process is interrupted."""
-        due = time.monotonic() + self._pause()
-        while not self._closing.wait(max(0.0, due - time.monotonic())):
+        """Play until ``stop`` is called or the process is interrupted."""
+        next_time = time.monotonic() + self._seconds_to_next_frame()
+        while not self._closing.wait(max(0.0, next_time - time.monotonic())):
             if self.playing.value:
                 self.show((self.frame + 1) % len(self.film))
-            due = max(due + self._pause(), time.monotonic())  # where the machine is slower, frames are not made up for
+            next_time = max(
+                next_time + self._seconds_to_next_frame(), time.monotonic()
+            )  # a slow machine does not catch up
 
     def stop(self) -> None:
-        """End ``run``, and the server."""
+        """End ``run`` and stop the server."""
         self._closing.set()
         _stop(self.server)
 
-    def _pause(self) -> float:
-        """Seconds until the next frame."""
+    def _seconds_to_next_frame(self) -> float:
+        """Return the time until the next frame [s]."""
         times = self.film.times
-        step = REST if self.frame + 1 >= len(times) else float(times[self.frame + 1] - times[self.frame])
-        return max(step / self.speed.value, 1 / FASTEST)
+        step = END_PAUSE_S if self.frame + 1 >= len(times) else float(times[self.frame + 1] - times[self.frame])
+        return max(step / self.speed.value, 1 / MAX_SENT_RATE_HZ)
 
-    def _play_controls(self) -> None:
+    def _add_play_controls(self) -> None:
         gui, last = self.server.gui, max(1, len(self.film) - 1)
-        self._clock = gui.add_markdown("")
+        self._status = gui.add_markdown("")
         self.slider = gui.add_slider("frame", min=0, max=last, step=1, initial_value=0, disabled=len(self.film) < 2)
         self.playing = gui.add_checkbox("play", initial_value=len(self.film) > 1)
-        self.speed = gui.add_slider("speed", min=SPEEDS[0], max=SPEEDS[1], step=0.1, initial_value=1.0)
+        self.speed = gui.add_slider("speed", min=SPEED_RANGE[0], max=SPEED_RANGE[1], step=0.1, initial_value=1.0)
 
         @self.slider.on_update
         def _(_: Any) -> None:
             if self.slider.value != self.frame:
                 self.show(int(self.slider.value))
 
-    def _layers(self) -> None:
+    def _add_group_switches(self) -> None:
         gui = self.server.gui
         with gui.add_folder("show"):
             for group in self.scene.groups:
-                box = gui.add_checkbox(group, initial_value=True)
-                box.on_update(lambda event, group=group: self._switch(group, event.target.value))
+                bounds = gui.add_checkbox(group, initial_value=True)
+                bounds.on_update(lambda event, group=group: self._switch(group, event.target.value))
 
     def _switch(self, group: str, visible: bool) -> None:
-        self._inside(lambda: self.scene.switch(group, visible))
+        self._run_on_server(lambda: self.scene.switch(group, visible))
 
-    def _readings(self) -> None:
-        """Colour bar, curves, depth images, notes."""
+    def _add_readings(self) -> None:
+        """Add colour bar, curves, depth images and notes to the panel."""
         gui, film = self.server.gui, self.film
-        if film.measured:
+        if film.has_values:
             gui.add_image(_colour_bar(), label=f"{film.legend}: 0 to {film.worst:g} {film.unit}; grey: {film.grey}")
         for name, curve in film.curves.items():
-            series = ({"label": "s"}, {"label": f"{name} [{curve.unit}]", "stroke": "#bd0026", "width": 1.5})
-            gui.add_uplot((curve.t, np.asarray(curve.values, float)), series, scales={"x": {"time": False}}, height=140)
+            label = {"label": f"{name} [{curve.unit}]", "stroke": "#bd0026", "width": 1.5}
+            data = (curve.t - film.times[0], np.asarray(curve.values, float))
+            axes = ({"label": "seconds from the first frame"}, label)
+            gui.add_uplot(data, axes, scales={"x": {"time": False}}, height=140)
         self._images = [
             (view, gui.add_image(np.zeros((8, 8, 3), np.uint8), label=f"depth of {name}"))
             for name, view in film.views.items()
@@ -150,12 +155,12 @@ class Viewer:
 
 
 def write_viser(film: Film, path: str | Path) -> Path:
-    """Write a film that plays by itself, without the controls.
+    """Write a film that plays by itself, without controls.
 
     Args:
         film: what to show.
-        path: ``.html``: one page with all in it, for any browser; ``.viser``: the scene alone, for viser's own client.
-            The file is there whole or not at all.
+        path: ``.html``: a self-contained page for any browser; ``.viser``: the scene alone, for viser's own client.
+            The file is written atomically.
 
     Returns:
         ``path``.
@@ -167,14 +172,14 @@ def write_viser(film: Film, path: str | Path) -> Path:
     server = _server(film, 0)
     try:
         scene = ViserScene(film, server)
-        _aim(server, film)
+        _set_camera(server, film)
         recorder = server.get_scene_serializer()
-        for frame, step in enumerate([*np.diff(film.times), REST]):
+        for frame, step in enumerate([*np.diff(film.times), END_PAUSE_S]):
             scene.show(frame)
             recorder.insert_sleep(float(step))
         page = path.suffix.lower() == ".html"
-        with write_atomically(path) as part:
-            part.write_bytes(recorder.as_html().encode() if page else recorder.serialize())
+        with write_atomically(path) as file:
+            file.write_bytes(recorder.as_html().encode() if page else recorder.serialize())
     finally:
         _stop(server)
     return path
@@ -188,9 +193,9 @@ def _running_loop() -> asyncio.AbstractEventLoop | None:
 
 
 def _server(film: Film, port: int) -> Any:
-    """A server that does not print: its words would be between those of the command."""
+    """Start a server that does not print between the lines of the command."""
     with redirect_stdout(io.StringIO()):
-        return viser().ViserServer(host=HOST, port=port, label=film.title, verbose=False)
+        return import_viser().ViserServer(host=SERVER_HOST, port=port, label=film.title, verbose=False)
 
 
 def _stop(server: Any) -> None:
@@ -198,38 +203,40 @@ def _stop(server: Any) -> None:
         server.stop()
 
 
-def _aim(server: Any, film: Film) -> None:
-    """Put the eye where pictures are taken from."""
-    camera = camera_for(film, WINDOW)
-    low, high = film.box
+def _set_camera(server: Any, film: Film) -> None:
+    """Set the initial camera to that of pictures."""
+    camera = fit_camera(film, BROWSER_VIEW_SIZE_PX)
+    low, high = film.bounds
     server.initial_camera.position = tuple(camera.T_world_camera[:3, 3])
     server.initial_camera.look_at = tuple((low + high) / 2)
     server.initial_camera.up = (0.0, 0.0, 1.0)
     server.initial_camera.fov = float(2 * np.arctan2(camera.height / 2, camera.K[1, 1]))
 
 
-def _words(film: Film, frame: int) -> str:
-    words = f"**{film.times[frame]:.3f} s**"
-    if DISTANCE in film.curves:
-        curve = film.curves[DISTANCE]
+def _status_text(film: Film, frame: int) -> str:
+    text = f"**{film.seconds(frame):.3f} s** from the first frame"
+    if DISTANCE_CURVE in film.curves:
+        curve = film.curves[DISTANCE_CURVE]
         now = curve.values[int(np.abs(curve.t - film.times[frame]).argmin())]
-        words += f", mean distance {now:.2f} {curve.unit}" if np.isfinite(now) else ", no points"
-    return words
+        text += f", mean distance {now:.2f} {curve.unit}" if np.isfinite(now) else ", no points"
+    return text
 
 
 def _colour_bar() -> Array:
-    """[12, 256, 3] from 0 on the left to the worst on the right."""
-    return np.tile(colours(np.linspace(0, 1, 256), 1.0), (12, 1, 1))
+    """Return a colour bar [12, 256, 3], from 0 on the left to the colour limit on the right."""
+    return np.tile(map_colours(np.linspace(0, 1, 256), 1.0), (12, 1, 1))
 
 
-def _depth_picture(view: View, frame: int) -> Array | None:
-    """A small picture of a depth image, black where the sensor saw nothing."""
-    raw = view.raw(frame)
-    if raw is None:
+def _depth_picture(view: CameraView, frame: int) -> Array | None:
+    """Return a small picture of a depth image, black where the depth is invalid; None if there is no image."""
+    depth_image = view.depth_image(frame)
+    if depth_image is None:
         return None
-    step = max(1, round(raw.shape[1] / DEPTH_SIZE))
-    small = raw[::step, ::step].astype(float)
+    step = max(1, round(depth_image.shape[1] / DEPTH_IMAGE_WIDTH_PX))
+    small = depth_image[::step, ::step].astype(float)
     seen = small[small > 0]
-    near, far = (seen.min(), np.quantile(seen, DEPTH_FAR)) if len(seen) else (0.0, 1.0)
+    near, far = (seen.min(), np.quantile(seen, DEPTH_COLOUR_QUANTILE)) if len(seen) else (0.0, 1.0)
     share = np.clip((small - near) / max(far - near, 1.0), 0, 1)
-    return np.where(small[..., None] > 0, colour_map(DEPTH_MAP)(share, bytes=True)[..., :3], 0).astype(np.uint8)
+    return np.where(small[..., None] > 0, get_colour_map(DEPTH_COLOUR_MAP)(share, bytes=True)[..., :3], 0).astype(
+        np.uint8
+    )

@@ -1,4 +1,4 @@
-"""What the ablation measures: rescaled parameters, distances of shapes, shares of the energy, agreement of ranks."""
+"""Measures of the ablation: rescaled parameters, distances of shapes, energy contributions, rank correlation."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 import torch
+from scipy.stats import spearmanr
 from torch import Tensor
 
 from torchcloth.dynamics import substep
@@ -14,38 +15,39 @@ from torchcloth.errors import InvalidInput
 from torchcloth.losses import chamfer_to_vertices
 from torchcloth.types import ClothState
 
-WITHOUT = ("E", "nu", "k", "gamma", "nu = 0")  # the last: nu put to 0 in mu as well, not only its term left out
+LEFT_OUT_TERMS = ("E", "nu", "k", "gamma", "nu = 0")  # "nu = 0" sets nu to 0 in mu as well; "nu" drops its term only
+CHAOS_FACTOR = 3.0  # distances below this multiple of the effect of a start moved by 1 um are not significant
 
 
-def unbounded(nu: float) -> float:
-    """The paper's f(nu) = 1 / (0.5 - nu) - 2: from [0, 0.5) to [0, inf), increasing."""
+def to_unbounded_poisson(nu: float) -> float:
+    """Return the paper's f(nu) = 1 / (0.5 - nu) - 2, which maps [0, 0.5) to [0, inf) and increases."""
     if not 0 <= nu < 0.5:
         raise InvalidInput("nu", got=f"{nu:g}", expected="a value in [0, 0.5)")
     return 1 / (0.5 - nu) - 2
 
 
-def bounded(f: float) -> float:
-    """The inverse of ``unbounded``."""
+def from_unbounded_poisson(f: float) -> float:
+    """Return the inverse of ``to_unbounded_poisson``."""
     if not f >= 0:
         raise InvalidInput("f(nu)", got=f"{f:g}", expected="a value >= 0")
     return 0.5 - 1 / (f + 2) if f < float("inf") else 0.5
 
 
 def scaled_poisson(nu: float, scale: float) -> float:
-    """Poisson's ratio at ``scale`` (1 = unchanged), scaled where it is unbounded: never outside [0, 0.5)."""
-    return bounded(scale * unbounded(nu))
+    """Scale Poisson's ratio in its unbounded form, so that it stays in [0, 0.5)."""
+    return from_unbounded_poisson(scale * to_unbounded_poisson(nu))
 
 
 def bidirectional_chamfer(a: Tensor, b: Tensor) -> float:
-    """Sum of both one-sided Chamfer distances [m] between clouds [N, 3] and [M, 3] m: mean distance to the nearest."""
+    """Return the sum of both one-sided Chamfer distances [m] (mean nearest distance) of clouds [N, 3], [M, 3] m."""
     return float(chamfer_to_vertices(a, b) + chamfer_to_vertices(b, a))
 
 
-def energies(model: Model, state: ClothState) -> dict[str, Tensor]:
-    """Elastic energy [...] J of a state, and what is left of it without each parameter, by ``WITHOUT``.
+def energies_without_each(model: Model, state: ClothState) -> dict[str, Tensor]:
+    """Return the elastic energy [...] J of a state, "total" and without the terms of each of ``LEFT_OUT_TERMS``.
 
-    The terms of the paper's energy density: E carries the whole membrane, nu the term lambda/2 (J - 1)^2, k and gamma
-    their own of the director.
+    In the paper's energy density, E carries the whole membrane, nu the term lambda/2 (J - 1)^2, and k and gamma their
+    terms of the director.
     """
     c = model.coefficients
     ratio = c.lam / (2 * c.mu)  # nu / (1 - 2 nu) in the paper's convention
@@ -68,23 +70,14 @@ def _elastic(model: Model, state: ClothState) -> Tensor:
     return energy["membrane"] + energy.get("director", torch.zeros(()))
 
 
-def contributions(energy: dict[str, np.ndarray]) -> dict[str, float]:
-    """The paper's C^j = (W - W^j) / W with W the mean over a motion's frames of ``energies`` [T] J."""
+def energy_contributions(energy: dict[str, np.ndarray]) -> dict[str, float]:
+    """Return the paper's C^j = (W - W^j) / W, where W is the mean energy [J] over the frames of a motion."""
     total = float(np.mean(energy["total"]))
-    return {j: (total - float(np.mean(energy[j]))) / total for j in WITHOUT}
+    return {j: (total - float(np.mean(energy[j]))) / total for j in LEFT_OUT_TERMS}
 
 
-def spearman(a: Sequence[float], b: Sequence[float]) -> float:
-    """Spearman's rank correlation, ties share their mean rank; NaN where one side is constant."""
-    if len(a) != len(b) or len(a) < 2:
-        raise InvalidInput("ranks", got=f"{len(a)} and {len(b)} values", expected="equally many, two or more")
-    ranks = [_ranks(np.asarray(values, dtype=float)) for values in (a, b)]
-    spread = [r - r.mean() for r in ranks]
-    scale = float(np.sqrt((spread[0] ** 2).sum() * (spread[1] ** 2).sum()))
-    return float((spread[0] * spread[1]).sum()) / scale if scale > 0 else float("nan")
-
-
-def _ranks(values: np.ndarray) -> np.ndarray:
-    _, inverse, count = np.unique(values, return_inverse=True, return_counts=True)
-    last = np.cumsum(count)
-    return ((2 * last - count + 1) / 2)[inverse]
+def rank_correlation(a: Sequence[float], b: Sequence[float]) -> float:
+    """Return Spearman's rank correlation; NaN if one side is constant."""
+    if min(len(set(a)), len(set(b))) < 2:  # scipy would warn
+        return float("nan")
+    return float(spearmanr(a, b).statistic)

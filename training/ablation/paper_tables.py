@@ -1,4 +1,4 @@
-"""The paper's two tables (Zheng et al., DiffCP, ablation study), as printed there."""
+"""Two tables of the paper (Zheng et al., DiffCP, ablation study), as printed there."""
 
 from __future__ import annotations
 

@@ -1,8 +1,7 @@
-"""What an ablation study shows: distances and shares of energy, and how they agree with the paper."""
+"""Report of an ablation: distances, energy contributions, and their agreement with the paper."""
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 from dataclasses import asdict
 from typing import Any
@@ -10,12 +9,14 @@ from typing import Any
 import numpy as np
 import torch
 
-from torchcloth._utils.files import write_text
 from torchcloth.errors import InvalidInput
 
-from .measures import bidirectional_chamfer, contributions, spearman
+from ..resumable import write_result
+from .ablation_figures import draw
+from .ablation_tables import print_study
+from .measures import CHAOS_FACTOR, bidirectional_chamfer, energy_contributions, rank_correlation
 from .paper_tables import CHAMFER, ENERGY
-from .runs import Name, Study
+from .runs import AblationStudy, SceneName
 from .scenes import LEVELS, PARAMETERS, PERTURBED, REFERENCE, Run, Variant
 
 CONVENTION = (
@@ -28,22 +29,25 @@ CONVENTION = (
     "means over the garments. The paper states no unit of its distances, here read as cm."
 )
 
-CHAOS = 3.0  # a distance below that many times what a start moved by 1 um changes says nothing
 
+def measure(
+    study: AblationStudy, scenes: Sequence[SceneName], variants: Sequence[Variant]
+) -> dict[SceneName, dict[str, Any]]:
+    """Measure distances and energy contributions of each scene from its finished runs.
 
-def measure(study: Study, scenes: Sequence[Name], wanted: Sequence[Variant]) -> dict[Name, dict[str, Any]]:
-    """Distances and shares of each scene, from the runs that are finished; scenes without reference are left out."""
-    found = {}
+    Scenes without a finished reference run are left out.
+    """
+    measured = {}
     for scene in scenes:
-        if not study.has(scene, REFERENCE):
+        if not study.has_run(scene, REFERENCE):
             continue
-        reference = study.read(scene, REFERENCE)
+        reference = study.load_run(scene, REFERENCE)
         final, mean = {}, {}
-        for variant in wanted:
-            if variant != REFERENCE and study.has(scene, variant):
-                final[variant], mean[variant] = _distances(study.read(scene, variant), reference)
-        found[scene] = {"final": final, "mean": mean, "energy": contributions(reference.energy)}
-    return found
+        for variant in variants:
+            if variant != REFERENCE and study.has_run(scene, variant):
+                final[variant], mean[variant] = _distances(study.load_run(scene, variant), reference)
+        measured[scene] = {"final": final, "mean": mean, "energy": energy_contributions(reference.energy)}
+    return measured
 
 
 def _distances(run: Run, reference: Run) -> tuple[float, float]:
@@ -52,39 +56,45 @@ def _distances(run: Run, reference: Run) -> tuple[float, float]:
     return 100 * distance[-1], 100 * float(np.mean(distance))
 
 
-def averaged(measured: dict[Name, dict[str, Any]], key: str) -> dict[str, dict[Any, float]]:
-    """Mean over the garments of each action, of the entries that all of them have."""
+def average_over_garments(measured: dict[SceneName, dict[str, Any]], key: str) -> dict[str, dict[Any, float]]:
+    """Return the mean over the garments of each action, for entries that all garments have."""
     out: dict[str, dict[Any, float]] = {}
     for action in dict.fromkeys(action for _, action in measured):
-        rows = [m[key] for (_, own), m in measured.items() if own == action]
+        rows = [entry[key] for (_, other), entry in measured.items() if other == action]
         common = [entry for entry in rows[0] if all(entry in row for row in rows)]
         out[action] = {entry: float(np.mean([row[entry] for row in rows])) for entry in common}
     return out
 
 
-def agreement(distance: dict[str, dict[Variant, float]], energy: dict[str, dict[str, float]]) -> dict[str, Any]:
-    """Spearman's rank correlation with the paper's numbers: of each table, per action and over all."""
+def compare_with_paper(
+    distance: dict[str, dict[Variant, float]], energy: dict[str, dict[str, float]]
+) -> dict[str, Any]:
+    """Return Spearman's rank correlation with the paper's tables, for each action and over all actions."""
     ours, paper = {}, {}
     for action, row in distance.items():
         cells = [variant for variant in row if variant.parameter in PARAMETERS]
         ours[action] = [row[v] for v in cells]
         paper[action] = [CHAMFER[action][v.parameter][LEVELS.index(v.level)] for v in cells]
-    out: dict[str, Any] = {"chamfer": {a: spearman(ours[a], paper[a]) for a in ours if len(ours[a]) > 1}}
+    out: dict[str, Any] = {"chamfer": {a: rank_correlation(ours[a], paper[a]) for a in ours if len(ours[a]) > 1}}
     everything = [[d for row in table.values() for d in row] for table in (ours, paper)]
     if len(everything[0]) > 1:
-        out["chamfer"]["all"] = spearman(*everything)
-    out["energy"] = {a: spearman([row[p] for p in PARAMETERS], list(ENERGY[a].values())) for a, row in energy.items()}
+        out["chamfer"]["all"] = rank_correlation(*everything)
+    out["energy"] = {
+        a: rank_correlation([row[p] for p in PARAMETERS], list(ENERGY[a].values())) for a, row in energy.items()
+    }
     out["order"] = {
         action: {"ours": _order(row), "paper": _paper_order(action, row)} for action, row in distance.items()
     }
     cells = {action: [d for v, d in row.items() if v.parameter in PARAMETERS] for action, row in distance.items()}
-    noise = {action: CHAOS * row[PERTURBED] for action, row in distance.items() if PERTURBED in row}
-    out["beyond_chaos"] = {a: [sum(d >= least for d in cells[a]), len(cells[a])] for a, least in noise.items()}
+    thresholds = {action: CHAOS_FACTOR * row[PERTURBED] for action, row in distance.items() if PERTURBED in row}
+    out["beyond_chaos"] = {
+        a: [sum(d >= threshold for d in cells[a]), len(cells[a])] for a, threshold in thresholds.items()
+    }
     return out
 
 
 def _order(row: dict[Variant, float]) -> list[str]:
-    """Parameters by their mean distance, the strongest first."""
+    """Return the parameters by decreasing mean distance."""
     mean = {p: np.mean([d for v, d in row.items() if v.parameter == p] or [0.0]) for p in PARAMETERS}
     return sorted(mean, key=lambda p: -mean[p])
 
@@ -94,40 +104,46 @@ def _paper_order(action: str, row: dict[Variant, float]) -> list[str]:
     return _order(cells)
 
 
-def report(study: Study, scenes: Sequence[Name], wanted: Sequence[Variant]) -> None:
+def report(study: AblationStudy, scenes: Sequence[SceneName], variants: Sequence[Variant]) -> None:
     """Print the tables and write result.json and the pictures.
 
     Raises:
-        InvalidInput: no scene has its reference run yet.
+        InvalidInput: no reference run is finished.
     """
-    from .ablation_figures import draw
-    from .ablation_tables import print_study
 
-    measured = measure(study, scenes, wanted)
+    measured = measure(study, scenes, variants)
     if not measured:
         raise InvalidInput("--out", got=f"no finished reference run in {study.folder}", expected="a study to report on")
-    distance, energy = averaged(measured, "final"), averaged(measured, "energy")
+    distance, energy = average_over_garments(measured, "final"), average_over_garments(measured, "energy")
     result = {
         "convention": CONVENTION,
         "setup": asdict(study.setup),
-        "runs": {"finished": sum(study.has(s, v) for s in scenes for v in wanted), "of": len(scenes) * len(wanted)},
-        "scenes": {" ".join(scene): _plain(m) for scene, m in measured.items()},
-        "actions": {action: {"chamfer_cm": _named(distance[action]), "energy": energy[action]} for action in distance},
+        "runs": {
+            "finished": sum(study.has_run(s, v) for s in scenes for v in variants),
+            "of": len(scenes) * len(variants),
+        },
+        "scenes": {" ".join(scene): _scene_entry(entry) for scene, entry in measured.items()},
+        "actions": {
+            action: {"chamfer_cm": _by_name(distance[action]), "energy": energy[action]} for action in distance
+        },
         "paper": {"chamfer": CHAMFER, "energy_percent": ENERGY, "levels": LEVELS},
-        "agreement": agreement(distance, energy)
-        | {"chamfer_mean": agreement(averaged(measured, "mean"), energy)["chamfer"]},
+        "agreement": compare_with_paper(distance, energy)
+        | {"chamfer_mean": compare_with_paper(average_over_garments(measured, "mean"), energy)["chamfer"]},
     }
-    text = json.dumps(result, indent=1).replace("NaN", "null") + "\n"
-    write_text(study.folder / "result.json", text)
+    write_result(study.folder / "result.json", "ablation", result)
     pictures = draw(study, list(measured), distance, energy)
     print_study(result, distance, energy, measured)
     print(f"result:   {study.folder / 'result.json'}")
     print("pictures: " + ", ".join(map(str, pictures)))
 
 
-def _plain(m: dict[str, Any]) -> dict[str, Any]:
-    return {"chamfer_cm": _named(m["final"]), "chamfer_mean_cm": _named(m["mean"]), "energy": m["energy"]}
+def _scene_entry(entry: dict[str, Any]) -> dict[str, Any]:
+    return {
+        "chamfer_cm": _by_name(entry["final"]),
+        "chamfer_mean_cm": _by_name(entry["mean"]),
+        "energy": entry["energy"],
+    }
 
 
-def _named(row: dict[Variant, float]) -> dict[str, float]:
+def _by_name(row: dict[Variant, float]) -> dict[str, float]:
     return {variant.name: value for variant, value in row.items()}

@@ -1,4 +1,4 @@
-"""A study on disk: every finished run is a file, so that it can be stopped at any time, continued and extended."""
+"""The ablation on disk: each finished run is a file, see ``ResumableStudy``."""
 
 from __future__ import annotations
 
@@ -17,100 +17,120 @@ import torch
 from torchcloth._utils.files import write_atomically
 from torchcloth.errors import InvalidInput, TorchclothError
 
-from ..resumable import check_settings, unreadable, write_settings
-from .measures import WITHOUT
+from ..resumable import ResumableStudy, damaged_file_error
+from .measures import LEFT_OUT_TERMS
 from .scenes import Run, Scene, Setup, Variant
 
-TRIANGLES_AT_ONCE = 6000  # of all runs that one process simulates together; fewer leave it idle, more leave the cache
-Name = tuple[str, str]  # of a scene: garment, action
+TRIANGLES_PER_BATCH = 6000  # of all runs that one process simulates together; fewer idle, more exceed the cache
+SceneName = tuple[str, str]  # garment, action
 
 
-class Study(NamedTuple):
-    """Where runs are kept; nothing is written before ``begin``."""
+class AblationStudy(ResumableStudy):
+    """Runs of an ablation, one NPZ file for each.
 
-    folder: Path
-    setup: Setup
+    Args:
+        folder: see ``ResumableStudy``.
+        setup: what all runs share.
 
-    def check(self) -> None:
-        """Raises InvalidInput where the folder cannot hold this study's runs."""
-        check_settings(self.folder, asdict(self.setup))
+    Raises:
+        InvalidInput: see ``ResumableStudy``.
+    """
 
-    def begin(self) -> None:
-        """Make the folder and note the settings."""
-        write_settings(self.folder, asdict(self.setup))
+    def __init__(self, folder: Path, setup: Setup) -> None:
+        super().__init__(folder, asdict(setup))
+        self.setup = setup
+
+    def start(self) -> None:
+        """Write the settings, if they are not there yet, and make the folder of the runs."""
+        super().start()
         (self.folder / "runs").mkdir(exist_ok=True)
 
-    def path(self, scene: Name, variant: Variant) -> Path:
-        """The file of a run."""
+    def path(self, scene: SceneName, variant: Variant) -> Path:
+        """Return the file of a run."""
         return self.folder / "runs" / f"{'-'.join(scene)}-{variant.name}.npz"
 
-    def has(self, scene: Name, variant: Variant) -> bool:
+    def has_run(self, scene: SceneName, variant: Variant) -> bool:
         """Whether a run is finished."""
         return self.path(scene, variant).exists()
 
-    def write(self, scene: Name, variant: Variant, run: Run) -> None:
-        """Keep a finished run; a crash leaves no half file."""
+    def save_run(self, scene: SceneName, variant: Variant, run: Run) -> None:
+        """Write a finished run atomically."""
         arrays: dict[str, Any] = {"t": run.t, "x": run.x, **run.energy}
-        with write_atomically(self.path(scene, variant)) as part:
-            np.savez(part, **arrays)
+        with write_atomically(self.path(scene, variant)) as file:
+            np.savez(file, **arrays)
 
-    def read(self, scene: Name, variant: Variant) -> Run:
-        """A finished run.
+    def load_run(self, scene: SceneName, variant: Variant) -> Run:
+        """Return a finished run.
 
         Raises:
             RecordingError: the file is damaged.
         """
         path = self.path(scene, variant)
         try:
-            with np.load(path) as found:
-                return Run(found["t"], found["x"], {key: found[key] for key in ("total", *WITHOUT)})
+            with np.load(path) as stored:
+                return Run(stored["t"], stored["x"], {key: stored[key] for key in ("total", *LEFT_OUT_TERMS)})
         except (ValueError, KeyError, EOFError, zipfile.BadZipFile):
-            raise unreadable(path) from None
+            raise damaged_file_error(path) from None
 
 
-class Task(NamedTuple):
-    """Runs of one scene that are simulated together."""
+class Batch(NamedTuple):
+    """Runs of one scene that are simulated together.
 
-    scene: Name
+    Attributes:
+        scene: garment and action.
+        variants: of the scene.
+    """
+
+    scene: SceneName
     variants: list[Variant]
 
-    def work(self, study: Study) -> Iterator[float]:
-        """Simulate and keep the runs; yields the share done."""
+    def simulate(self, study: AblationStudy) -> Iterator[float]:
+        """Simulate and save the runs; yields the fraction done."""
         try:
-            for share, runs in Scene(study.setup, *self.scene).simulate(self.variants):
+            for fraction, runs in Scene(study.setup, *self.scene).simulate(self.variants):
                 for variant, run in zip(self.variants, runs, strict=False):
-                    study.write(self.scene, variant, run)
-                yield share
+                    study.save_run(self.scene, variant, run)
+                yield fraction
         except TorchclothError as error:
             names = ", ".join(variant.name for variant in self.variants)
             raise TorchclothError(f"{' '.join(self.scene)} ({names}): {error}") from error
 
 
-def missing(study: Study, scenes: list[Name], variants: list[Variant], batch: int | None = None) -> list[Task]:
-    """What is still to be simulated, in batches; references first, so that a partial study can be read."""
-    size = batch or max(1, TRIANGLES_AT_ONCE // study.setup.triangles)
-    tasks = []
+def plan_batches(
+    study: AblationStudy, scenes: list[SceneName], variants: list[Variant], batch: int | None = None
+) -> list[Batch]:
+    """Return the missing runs in batches, references first, so that a partial study can be reported."""
+    size = batch or max(1, TRIANGLES_PER_BATCH // study.setup.triangles)
+    batches: list[Batch] = []
     for scene in scenes:
-        left = [variant for variant in variants if not study.has(scene, variant)]
-        tasks += [Task(scene, left[i : i + size]) for i in range(0, len(left), size)]
-    return sorted(tasks, key=lambda task: variants.index(task.variants[0]))
+        plan_batches = [variant for variant in variants if not study.has_run(scene, variant)]
+        batches += [Batch(scene, plan_batches[i : i + size]) for i in range(0, len(plan_batches), size)]
+    return sorted(batches, key=lambda batch: variants.index(batch.variants[0]))
 
 
-def simulate(study: Study, tasks: list[Task], jobs: int, report: Callable[[float, Task], None]) -> None:
-    """Do all tasks, in ``jobs`` processes; ``report`` hears the number of tasks done (with fractions) and the last.
+def simulate_batches(
+    study: AblationStudy, batches: list[Batch], jobs: int, report: Callable[[float, Batch], None]
+) -> None:
+    """Simulate all batches in ``jobs`` processes.
+
+    Args:
+        study: to which runs are saved.
+        batches: to be simulated.
+        jobs: number of processes.
+        report: called with the number of batches done, with fractions, and the last batch.
 
     Raises:
-        TorchclothError: the first failure; the other finished runs are kept.
+        TorchclothError: the first failure; the other finished runs remain.
     """
-    study.begin()
+    study.start()
     if jobs == 1:
-        for done, task in enumerate(tasks):
-            for share in task.work(study):
-                report(done + share, task)
+        for done, batch in enumerate(batches):
+            for fraction in batch.simulate(study):
+                report(done + fraction, batch)
         return
-    pool = ProcessPoolExecutor(min(jobs, len(tasks) or 1), get_context("spawn"), initializer=_prepare)
+    pool = ProcessPoolExecutor(min(jobs, len(batches) or 1), get_context("spawn"), initializer=_prepare_worker)
     try:
-        pending = {pool.submit(_work, study, task): task for task in tasks}
+        pending = {pool.submit(_simulate_batch, study, batch): batch for batch in batches}
         for done, future in enumerate(as_completed(pending)):
             try:
                 future.result()
@@ -123,8 +143,8 @@ def simulate(study: Study, tasks: list[Task], jobs: int, report: Callable[[float
         pool.shutdown(cancel_futures=True)
 
 
-def _prepare() -> None:
-    """A worker: one thread, the default floats of the study, quiet when the terminal interrupts."""
+def _prepare_worker() -> None:
+    """Set one thread and the study's precision, and stay quiet when the terminal interrupts."""
     import signal
 
     signal.signal(signal.SIGINT, signal.SIG_DFL)
@@ -132,6 +152,6 @@ def _prepare() -> None:
     torch.set_default_dtype(torch.float64)
 
 
-def _work(study: Study, task: Task) -> None:
-    for _ in task.work(study):
+def _simulate_batch(study: AblationStudy, batch: Batch) -> None:
+    for _ in batch.simulate(study):
         pass

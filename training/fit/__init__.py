@@ -1,5 +1,7 @@
-"""Gradient fits as Lightning runs: ``python -m torchcloth.training.fit --config FILE``; see docs/how-to/train-with-lightning.md.
+"""Gradient fits as Lightning runs: ``python -m torchcloth.training.fit --config FILE``.
 
-Scalars, fields per triangle, or a network that feeds them, learned from many episodes, on as many processes as there
-are episodes at a step.
+See docs/how-to/train-with-lightning.md.
+
+Scalars, fields with one value per triangle, or a network that gives them, are learned from many episodes. A run may
+use as many processes as there are episodes in a step.
 """

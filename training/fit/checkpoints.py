@@ -1,7 +1,7 @@
-"""Checkpoints that are there whole or not at all.
+"""Atomic writing of checkpoints.
 
-Lightning writes one to the system's folder for temporary files and moves it; between two file systems that is a copy
-over the only one.
+Lightning writes a checkpoint to the system's temporary folder and moves it. Between two file systems this copies over
+the only checkpoint, which is lost if the copy is interrupted.
 """
 
 from __future__ import annotations
@@ -16,18 +16,18 @@ from lightning.pytorch.plugins.io import TorchCheckpointIO
 from torchcloth._utils.files import write_atomically
 
 
-class Whole(TorchCheckpointIO):
-    """Written beside its place, then put there.
+class AtomicCheckpointIO(TorchCheckpointIO):
+    """Checkpoint writer that writes beside the target and then renames.
 
     Args:
-        outdated: results of an earlier run in the folder, which the first checkpoint takes the place of.
+        outdated: results of an earlier run in the folder, removed after the first checkpoint.
     """
 
     def __init__(self, outdated: Iterable[Path] = ()) -> None:
         self.outdated = list(outdated)
 
     def save_checkpoint(self, checkpoint: dict[str, Any], path: Any, storage_options: Any = None) -> None:
-        """As torch.save has it; ``storage_options`` are not used."""
+        """Save a checkpoint with ``torch.save``; ``storage_options`` are ignored."""
         with write_atomically(Path(path)) as part:
             torch.save(checkpoint, part)
         for path in self.outdated:

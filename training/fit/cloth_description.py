@@ -1,4 +1,4 @@
-"""The cloth that an episode describes, as plain tensors and numbers: what a checkpoint keeps to load without data."""
+"""Description of an episode's cloth in plain tensors and numbers, so that a checkpoint can be loaded without data."""
 
 from __future__ import annotations
 
@@ -19,35 +19,35 @@ from torchcloth.recordings import ClothInfo, Collider, GraspInfo, Recording
 
 from .config import Model
 
-LEFT_OUT = {"extra", "initial_vertices"}
+EPISODE_ONLY_FIELDS = {"extra", "initial_vertices"}
 
 
-def described(recording: Recording) -> dict[str, Any]:
-    """Nested dicts of tensors, numbers and text, without what only one episode has."""
+def describe_cloth(recording: Recording) -> dict[str, Any]:
+    """Describe the cloth of an episode as nested dicts of tensors, numbers and text, without episode-specific data."""
     parts = {"grasps": recording.grasps, "colliders": recording.colliders}
     return {
-        "cloth": _plain(recording.cloth),
-        **{key: {name: _plain(part) for name, part in own.items()} for key, own in parts.items()},
+        "cloth": _to_plain(recording.cloth),
+        **{key: {name: _to_plain(part) for name, part in fields.items()} for key, fields in parts.items()},
         "gravity": torch.as_tensor(recording.gravity),
         "air_density": recording.air_density,
     }
 
 
-def built(description: dict[str, Any], model: Model) -> Cloth:
-    """The cloth again, at the start values of ``model``.
+def build_described_cloth(description: dict[str, Any], model: Model) -> Cloth:
+    """Build the cloth from its description, at the start values of ``model``.
 
     Raises:
-        InvalidInput: start values of parameters that it does not have.
+        InvalidInput: a start value belongs to an unknown parameter.
     """
     recording = Recording(
-        cloth=ClothInfo(**_arrays(description["cloth"])),
+        cloth=ClothInfo(**_to_arrays(description["cloth"])),
         provenance="measured",
-        grasps={name: GraspInfo(**_arrays(grasp)) for name, grasp in description["grasps"].items()},
-        colliders={name: Collider(**_arrays(part)) for name, part in description["colliders"].items()},
+        grasps={name: GraspInfo(**_to_arrays(grasp)) for name, grasp in description["grasps"].items()},
+        colliders={name: Collider(**_to_arrays(part)) for name, part in description["colliders"].items()},
         gravity=description["gravity"].numpy(),
         air_density=description["air_density"],
     )
-    with precision(model.precision):
+    with default_precision(model.precision):
         cloth = build_cloth(recording, contact=Contact(model.contact) if model.contact else None)
         cloth.engine = model.engine  # type: ignore[assignment] - checked with the config
         names = find_scalar_parameters(cloth)
@@ -60,15 +60,15 @@ def built(description: dict[str, Any], model: Model) -> Cloth:
 
 
 def same_cloth(first: dict[str, Any], other: dict[str, Any]) -> bool:
-    """Whether two descriptions give the same model, but for start values and the density's error."""
-    free = {"nominal", "areal_density_std"}
-    one, two = ({**d, "cloth": {k: v for k, v in d["cloth"].items() if k not in free}} for d in (first, other))
-    return _same(one, two)
+    """Whether two descriptions give the same model, except for start values and the density's error."""
+    ignored = {"nominal", "areal_density_std"}
+    first, second = ({**d, "cloth": {k: v for k, v in d["cloth"].items() if k not in ignored}} for d in (first, other))
+    return _equal(first, second)
 
 
 @contextmanager
-def precision(name: str) -> Iterator[None]:
-    """torch's default type for floats, "float64" or "float32", for a while."""
+def default_precision(name: str) -> Iterator[None]:
+    """Set torch's default float type, "float64" or "float32", within a context."""
     before = torch.get_default_dtype()
     torch.set_default_dtype(getattr(torch, name))
     try:
@@ -77,18 +77,18 @@ def precision(name: str) -> Iterator[None]:
         torch.set_default_dtype(before)
 
 
-def _plain(part: Any) -> dict[str, Any]:
-    own = {key: value for key, value in asdict(part).items() if key not in LEFT_OUT}
-    return {k: torch.as_tensor(v.copy()) if isinstance(v, np.ndarray) else v for k, v in own.items()}
+def _to_plain(part: Any) -> dict[str, Any]:
+    fields = {key: value for key, value in asdict(part).items() if key not in EPISODE_ONLY_FIELDS}
+    return {k: torch.as_tensor(v.copy()) if isinstance(v, np.ndarray) else v for k, v in fields.items()}
 
 
-def _arrays(part: dict[str, Any]) -> dict[str, Any]:
+def _to_arrays(part: dict[str, Any]) -> dict[str, Any]:
     return {key: value.numpy() if isinstance(value, Tensor) else value for key, value in part.items()}
 
 
-def _same(one: Any, two: Any) -> bool:
-    if isinstance(one, dict) and isinstance(two, dict):
-        return one.keys() == two.keys() and all(_same(one[key], two[key]) for key in one)
-    if isinstance(one, Tensor) and isinstance(two, Tensor):
-        return one.shape == two.shape and bool(torch.allclose(one.double(), two.double(), rtol=0, atol=1e-6))
-    return bool(one == two)
+def _equal(first: Any, second: Any) -> bool:
+    if isinstance(first, dict) and isinstance(second, dict):
+        return first.keys() == second.keys() and all(_equal(first[key], second[key]) for key in first)
+    if isinstance(first, Tensor) and isinstance(second, Tensor):
+        return first.shape == second.shape and bool(torch.allclose(first.double(), second.double(), rtol=0, atol=1e-6))
+    return bool(first == second)

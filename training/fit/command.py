@@ -13,14 +13,14 @@ from torchcloth.errors import MissingDependency, TorchclothError
 
 from .config import CHECKPOINT, load
 
-NAME = "torchcloth.training.fit"
+MODULE_NAME = "torchcloth.training.fit"
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Entry point; returns the exit code (0 done, 2 wrong input, 130 interrupted)."""
-    options, config, began = _parser().parse_intermixed_args(arguments), None, time.time()
+    """Run the command; return the exit code (0 done, 2 wrong input, 130 interrupted)."""
+    options, config, started = _parser().parse_intermixed_args(arguments), None, time.time()
     try:
-        if find_spec("lightning") is None:  # which brings YAML
+        if find_spec("lightning") is None:  # the YAML reader comes with it
             raise MissingDependency("lightning is not installed", remedy='run: pip install "torchcloth[training]"')
         config = load(options.config, options.overrides)
         from .run import fit
@@ -31,24 +31,26 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print(f"fit: {error}", file=sys.stderr)
         return 2
     except RuntimeError as error:
-        if not _left_alone(error):
+        if not _is_lost_connection(error):
             raise
-        print("fit: another process ended; see its own line", file=sys.stderr)
+        print("fit: another process ended; see its message", file=sys.stderr)
         return 2
     except (KeyboardInterrupt, SystemExit):  # Lightning turns the first into the second
-        kept = config is not None and _kept(config.folder / CHECKPOINT, since=0.0 if options.resume else began)
-        further = "; the same command with --resume goes on after the last whole step" if kept else ""
-        print(f"fit: stopped{further}", file=sys.stderr)
+        has_checkpoint = config is not None and _has_checkpoint(
+            config.folder / CHECKPOINT, since=0.0 if options.resume else started
+        )
+        hint = "; the same command with --resume continues after the last finished step" if has_checkpoint else ""
+        print(f"fit: stopped{hint}", file=sys.stderr)
         return 130
 
 
-def _kept(checkpoint: Path, since: float) -> bool:
-    """Whether a checkpoint is there, and not of an earlier run."""
+def _has_checkpoint(checkpoint: Path, since: float) -> bool:
+    """Whether this run has written a checkpoint."""
     return checkpoint.is_file() and checkpoint.stat().st_mtime >= since
 
 
-def _left_alone(error: RuntimeError) -> bool:
-    """By the other processes, one of which has said why."""
+def _is_lost_connection(error: RuntimeError) -> bool:
+    """Whether the connection to other processes was lost, one of which has printed the reason."""
     import torch.distributed as distributed
 
     running = distributed.is_available() and distributed.is_initialized()
@@ -57,12 +59,12 @@ def _left_alone(error: RuntimeError) -> bool:
 
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
-        prog=f"python -m {NAME}",
-        description="Fit what a config names to episodes, by gradient descent through the simulation.",
-        epilog="On several processes: run.processes=N, or under torchrun or srun; see docs/how-to/train-with-lightning.md.",
+        prog=f"python -m {MODULE_NAME}",
+        description="Fit the parameters that a config names to episodes, by gradient descent through the simulation.",
+        epilog="Several processes: run.processes=N, torchrun or srun; see docs/how-to/train-with-lightning.md.",
     )
     add = parser.add_argument
     add("--config", required=True, metavar="FILE", help="YAML file, or the name of a shipped one: demo")
-    add("--resume", action="store_true", help="go on where the run into the config's `out` was stopped")
-    add("overrides", nargs="*", metavar="KEY=VALUE", help="instead of the config's, e.g. optimizer.steps=10 out=out/2")
+    add("--resume", action="store_true", help="resume the run in the config's `out` that was stopped")
+    add("overrides", nargs="*", metavar="KEY=VALUE", help="replace values of the config, e.g. optimizer.steps=10 out=b")
     return parser

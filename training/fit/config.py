@@ -1,4 +1,8 @@
-"""What a run is made of, as dataclasses; read from YAML with overrides, every key checked."""
+"""Configuration of a run as dataclasses, read from YAML with overrides; every key is checked.
+
+The reader is our own because each error must be one line that says what, got, expected and remedy. jsonargparse
+reports some errors over several lines, does not list the known keys, and does not accept ``key: value`` for a list.
+"""
 
 from __future__ import annotations
 
@@ -16,134 +20,186 @@ CHECKPOINT = "last.ckpt"  # in a run's folder
 
 @dataclass(frozen=True)
 class Data:
-    """Episodes: folders, globs of folders, or ``example:NAME`` for one that is shipped."""
+    """Episodes: folders, globs of folders, or ``example:NAME`` for a shipped one.
+
+    Attributes:
+        train: episodes to train with.
+        val: episodes to validate with.
+        val_motion: values of ``split.motion`` whose episodes are moved from ``train`` to ``val``.
+        per_step: number of episodes in each optimiser step; 0: all.
+    """
 
     train: list[str]
     val: list[str] = field(default_factory=list)
-    val_motion: list[str] = field(default_factory=list)  # held out of ``train``: episodes of these ``split.motion``
-    per_step: int = 0  # episodes at every optimiser step; 0: all
+    val_motion: list[str] = field(default_factory=list)
+    per_step: int = 0
 
 
 @dataclass(frozen=True)
 class Model:
-    """The cloth that the first episode describes."""
+    """Model of the cloth that the first episode describes.
 
-    start: dict[str, float] = field(default_factory=dict)  # values by public name, SI units
-    contact: float = 0.0  # m, spacing of the contact grid; 0: no contact between layers
-    dt: float = 0.0  # s, largest substep; 0: the stable one
+    Attributes:
+        start: start values by public name, in SI units.
+        contact: spacing of the contact grid [m]; 0: no contact between layers.
+        dt: largest substep [s]; 0: the stable one.
+        precision: "float64" or "float32".
+        engine: "auto", "reference" or "fused".
+    """
+
+    start: dict[str, float] = field(default_factory=dict)
+    contact: float = 0.0
+    dt: float = 0.0
     precision: str = "float64"
     engine: str = "auto"
 
 
 @dataclass(frozen=True)
 class Network:
-    """A torch module that gives parameters from the place on the pattern."""
+    """A torch module that maps the place on the pattern to parameters.
 
-    module: str  # "package.module.Class"
-    gives: list[str]  # parameters that it gives, one column each
+    Attributes:
+        module: "package.module.Class".
+        outputs: names of the parameters, one for each column of the output.
+        arguments: of the class.
+    """
+
+    module: str
+    outputs: list[str]
     arguments: dict[str, Any] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
 class Learn:
-    """What is learned."""
+    """Parameters that are learned.
 
-    parameters: list[str] = field(default_factory=list)  # one number each
-    fields: list[str] = field(default_factory=list)  # one number for each triangle
+    Attributes:
+        parameters: names of scalars.
+        fields: names of fields with one value per triangle.
+        network: that gives further parameters.
+        roughness: weight of the mean squared difference of unconstrained values between adjacent triangles.
+    """
+
+    parameters: list[str] = field(default_factory=list)
+    fields: list[str] = field(default_factory=list)
     network: Network | None = None
-    roughness: float = 0.0  # price of a unit of mean squared difference between neighbouring triangles, unconstrained
+    roughness: float = 0.0
 
 
 @dataclass(frozen=True)
 class Optimizer:
-    """Adam."""
+    """Settings of Adam.
 
-    rate: float = 0.1  # of a step: about 10 % of a positive parameter, of a typical amplitude
+    Attributes:
+        learning_rate: 0.1 is about 10 % of a positive parameter, or of a typical amplitude, in a step.
+        steps: number of steps.
+        half_life: number of steps after which the learning rate is halved; 0: constant.
+    """
+
+    learning_rate: float = 0.1
     steps: int = 50
-    half_life: float = 0.0  # steps after which the rate is half; 0: constant
+    half_life: float = 0.0
 
 
 @dataclass(frozen=True)
 class Run:
-    """Processes, loggers, seed."""
+    """Settings of the run.
 
-    processes: int = 1  # on each node
+    Attributes:
+        processes: number on each node.
+        nodes: number of nodes.
+        seed: of networks and of the order of episodes.
+        validate_every: number of steps between validations.
+        loggers: "csv", "tensorboard" or both.
+    """
+
+    processes: int = 1
     nodes: int = 1
     seed: int = 0
-    validate_every: int = 1  # steps
+    validate_every: int = 1
     loggers: list[str] = field(default_factory=lambda: ["csv"])
 
 
 @dataclass(frozen=True)
 class Config:
-    """One run."""
+    """Configuration of a run.
+
+    Attributes:
+        out: folder for checkpoints and results.
+        data: see ``Data``.
+        learn: see ``Learn``.
+        loss: scale of each loss by name, in the residual's unit; see ``Loss``.
+        model: see ``Model``.
+        optimizer: see ``Optimizer``.
+        run: see ``Run``.
+    """
 
     out: str
     data: Data
     learn: Learn
-    loss: dict[str, float] = field(default_factory=lambda: {"points": 1e-3})  # by name, what counts as 1 in its unit
+    loss: dict[str, float] = field(default_factory=lambda: {"points": 1e-3})
     model: Model = field(default_factory=Model)
     optimizer: Optimizer = field(default_factory=Optimizer)
     run: Run = field(default_factory=Run)
 
     @property
     def folder(self) -> Path:
-        """``out``, which may be in somebody's home."""
+        """Path of ``out`` with the user's home expanded."""
         return Path(self.out).expanduser()
 
 
-CHOICES = {
+ALLOWED_VALUES = {
     "model.precision": ("float64", "float32"),
     "model.engine": ("auto", "reference", "fused"),
     "run.loggers": ("csv", "tensorboard"),
 }
-AT_LEAST = {"data.per_step": 0, "model.contact": 0, "model.dt": 0, "learn.roughness": 0, "optimizer.half_life": 0}
-AT_LEAST |= {"optimizer.steps": 1, "run.processes": 1, "run.nodes": 1, "run.validate_every": 1, "run.seed": 0}
+LOWER_BOUNDS = {"data.per_step": 0, "model.contact": 0, "model.dt": 0, "learn.roughness": 0, "optimizer.half_life": 0}
+LOWER_BOUNDS |= {"optimizer.steps": 1, "run.processes": 1, "run.nodes": 1, "run.validate_every": 1, "run.seed": 0}
 
 
 def load(path: str, overrides: Sequence[str] = ()) -> Config:
-    """A YAML file, or the name of a shipped one, with ``key.of.it=value`` replaced.
+    """Read a YAML file, or a shipped one by its name, and apply overrides ``section.key=value``.
 
     Raises:
-        InvalidInput: no such file, not YAML, an unknown key, a value of the wrong kind.
+        InvalidInput: the file does not exist or is not YAML, a key is unknown, or a value has the wrong type.
     """
-    content = _mapping(path, _parsed(path, _text(path)))
+    content = _mapping(path, _parse_yaml(path, _read_text(path)))
     for pair in overrides:
         key, equals, value = pair.partition("=")
         if not equals or not key:
             raise InvalidInput("override", got=repr(pair), expected="KEY=VALUE, e.g. optimizer.steps=10")
-        _put(content, key, _parsed(key, value))
+        _override(content, key, _parse_yaml(key, value))
     return from_dict(content)
 
 
 def from_dict(content: Mapping[str, Any]) -> Config:
-    """Nested dicts, checked.
+    """Build a configuration from nested dicts and check it.
 
     Raises:
-        InvalidInput: an unknown key, a value of the wrong kind.
+        InvalidInput: a key is unknown, or a value has the wrong type.
     """
     config = _build(Config, content, "")
     try:
-        config.folder  # noqa: B018 - of a user whom this machine has
+        config.folder  # noqa: B018 - fails if ``~user`` is unknown
     except RuntimeError as error:
         raise InvalidInput("config: out", got=f"{config.out} ({error})", expected="a folder") from None
-    for key, legal in {**CHOICES, **AT_LEAST}.items():
+    for key, legal in {**ALLOWED_VALUES, **LOWER_BOUNDS}.items():
         section, _, name = key.partition(".")
         value = getattr(getattr(config, section), name)
         if isinstance(legal, tuple):
-            wrong = [v for v in (value if isinstance(value, list) else [value]) if v not in legal]
-            if wrong:
-                raise InvalidInput(f"config: {key}", got=repr(wrong[0]), expected=" or ".join(legal))
+            bad_values = [v for v in (value if isinstance(value, list) else [value]) if v not in legal]
+            if bad_values:
+                raise InvalidInput(f"config: {key}", got=repr(bad_values[0]), expected=" or ".join(legal))
         elif not (value >= legal and math.isfinite(value)):
             raise InvalidInput(f"config: {key}", got=value, expected=f"at least {legal}, and finite")
     if config.run.seed >= 2**32:
         raise InvalidInput("config: run.seed", got=config.run.seed, expected="below 2^32")
-    if not 0 < config.optimizer.rate < math.inf:
-        raise InvalidInput("config: optimizer.rate", got=config.optimizer.rate, expected="more than 0, and finite")
+    if not 0 < (rate := config.optimizer.learning_rate) < math.inf:
+        raise InvalidInput("config: optimizer.learning_rate", got=rate, expected="more than 0, and finite")
     return config
 
 
-def _text(path: str) -> str:
+def _read_text(path: str) -> str:
     shipped = resources.files("torchcloth.training") / "configs"
     file = Path(path)
     if not file.is_file() and (shipped / f"{path}.yaml").is_file():
@@ -156,15 +212,15 @@ def _text(path: str) -> str:
         raise InvalidInput("--config", got=f"{path} ({type(error).__name__})", expected=expected) from None
 
 
-def _parsed(what: str, text: str) -> Any:
+def _parse_yaml(what: str, text: str) -> Any:
     import yaml
 
     class Loader(yaml.SafeLoader):
-        """Of a key that stands there twice, one would be ignored."""
+        """Loader that refuses a key that is given twice, because one of the values would be ignored."""
 
         def construct_mapping(self, node: Any, deep: bool = False) -> dict[Any, Any]:
-            own = (key for key, _ in node.value if key.tag != "tag:yaml.org,2002:merge")
-            keys = [self.construct_object(key, deep=True) for key in own]
+            plain_keys = (key for key, _ in node.value if key.tag != "tag:yaml.org,2002:merge")
+            keys = [self.construct_object(key, deep=True) for key in plain_keys]
             for k, key in enumerate(keys):
                 if key in keys[:k]:
                     raise ValueError(f"{key!r} twice{node.start_mark}")
@@ -172,28 +228,28 @@ def _parsed(what: str, text: str) -> Any:
 
     try:
         return yaml.load(text, Loader)
-    except (yaml.YAMLError, ValueError) as error:  # a day that no month has
+    except (yaml.YAMLError, ValueError) as error:  # ValueError: e.g. an impossible date
         raise InvalidInput(what, got=str(error), expected="YAML") from None
 
 
-def _put(content: dict[str, Any], key: str, value: Any) -> None:
-    """Into nested dicts; names with dots (``model.start.air.normal``) are keys of what has no sections."""
+def _override(content: dict[str, Any], key: str, value: Any) -> None:
+    """Set a value in nested dicts; below sections, names may contain dots (``model.start.air.normal``)."""
     section, rest = key.split(".")[0], key
     kind: Any = Config
     while "." in rest and is_dataclass(kind):
         section, rest = rest.split(".", 1)
-        kind = _section(get_type_hints(kind).get(section))
-        inner = content.get(section) or {}
-        plain = kind is not None and not is_dataclass(kind) and get_origin(kind) is not dict
-        if plain or not isinstance(inner, dict):
+        kind = _dataclass_of(get_type_hints(kind).get(section))
+        subsection = content.get(section) or {}
+        is_leaf = kind is not None and not is_dataclass(kind) and get_origin(kind) is not dict
+        if is_leaf or not isinstance(subsection, dict):
             raise InvalidInput("override", got=key, expected=f"nothing inside of {section!r}, which has no keys")
-        content[section] = inner = dict(inner)
-        content = inner
+        content[section] = subsection = dict(subsection)
+        content = subsection
     content[rest] = value
 
 
-def _section(kind: Any) -> Any:
-    """The dataclass in ``kind | None``."""
+def _dataclass_of(kind: Any) -> Any:
+    """Return the dataclass in ``kind | None``."""
     return next((k for k in get_args(kind) if is_dataclass(k)), kind)
 
 
@@ -216,18 +272,22 @@ def _build(kind: Any, content: Any, where: str) -> Any:
 
 
 def _value(kind: Any, value: Any, where: str) -> Any:
-    if is_dataclass(_section(kind)):
-        return None if value is None and kind is not _section(kind) else _build(_section(kind), value, where + ".")
-    origin, inner = get_origin(kind), get_args(kind)
+    if is_dataclass(_dataclass_of(kind)):
+        return (
+            None
+            if value is None and kind is not _dataclass_of(kind)
+            else _build(_dataclass_of(kind), value, where + ".")
+        )
+    origin, subsection = get_origin(kind), get_args(kind)
     if origin is dict:
-        return {key: _value(inner[1], item, f"{where}.{key}") for key, item in _mapping(where, value).items()}
+        return {key: _value(subsection[1], item, f"{where}.{key}") for key, item in _mapping(where, value).items()}
     if origin is list:
-        return [_value(inner[0], item, where) for item in (value if isinstance(value, list) else [value])]
+        return [_value(subsection[0], item, where) for item in (value if isinstance(value, list) else [value])]
     return _scalar(kind, value, where)
 
 
 def _scalar(kind: Any, value: Any, where: str) -> Any:
-    """YAML 1.1 reads 5e4 as text."""
+    """Check a scalar; numbers such as 5e4, which YAML 1.1 reads as text, are converted."""
     if kind is Any or (kind in (int, str) and type(value) is kind):
         return value
     try:

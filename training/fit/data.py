@@ -1,4 +1,4 @@
-"""Episodes for Lightning: found, split, and dealt to the processes without padding."""
+"""Episodes for Lightning: read, split, and distributed to the processes without padding."""
 
 from __future__ import annotations
 
@@ -17,25 +17,25 @@ from torchcloth.identification import Episode, build_episode
 from torchcloth.recordings import Recording
 from torchcloth.recordings.size_checks import check_size
 
-from .cloth_description import described, same_cloth
+from .cloth_description import describe_cloth, same_cloth
 from .config import Data
 
-EXAMPLE = "example:"
+EXAMPLE_PREFIX = "example:"
 
 
-def found(data: Data) -> tuple[list[Recording], list[Recording]]:
-    """The episodes to train with and to validate with.
+def read_episodes(data: Data) -> tuple[list[Recording], list[Recording]]:
+    """Read the episodes for training and validation.
 
     Raises:
-        InvalidInput: a pattern without episodes, nothing to train with, an episode to do both with, or episodes of
-            different cloths.
-        RecordingError: an episode that cannot be trusted, or was seen in another unit than metres.
+        InvalidInput: a pattern matches nothing, there is nothing to train with, an episode is in both sets, or the
+            episodes show different cloths.
+        RecordingError: an episode is inconsistent, or is not in metres.
     """
-    places = _folders(data.train, "data.train"), _folders(data.val, "data.val")
-    if both := places[0].keys() & places[1].keys():
-        got = f"{min(both)}, which is in data.train, too"
+    folders = _folders(data.train, "data.train"), _folders(data.val, "data.val")
+    if shared := folders[0].keys() & folders[1].keys():
+        got = f"{min(shared)}, which is in data.train, too"
         raise InvalidInput("config: data.val", got=got, expected="episodes that are not trained with")
-    train, val = ([recordings.read(folder) for folder in own.values()] for own in places)
+    train, val = ([recordings.read(folder) for folder in selection.values()] for selection in folders)
     motions = {r.split.get("motion") for r in train}
     for motion in data.val_motion:
         if motion not in motions:
@@ -47,24 +47,24 @@ def found(data: Data) -> tuple[list[Recording], list[Recording]]:
         raise InvalidInput("config: data.train", got="no episodes", expected="one or more to train with")
     for recording in (*train, *val):
         check_size(recording)
-    first = described(train[0])
+    first = describe_cloth(train[0])
     for other in (*train[1:], *val):
-        if not same_cloth(first, described(other)):
+        if not same_cloth(first, describe_cloth(other)):
             expected = f"cloth, grasps and surroundings of {train[0].path}"
             raise InvalidInput(f"{other.path}: another cloth", got="other values in episode.json", expected=expected)
     return train, val
 
 
 def _folders(patterns: Sequence[str], key: str) -> dict[Path, Path]:
-    """As they are named, by where they are: each once."""
+    """Return the named folders by their resolved paths, each once."""
     folders: dict[Path, Path] = {}
     for pattern in patterns:
-        if pattern.startswith(EXAMPLE):
-            shipped = resources.files("torchcloth") / "examples" / pattern.removeprefix(EXAMPLE)
+        if pattern.startswith(EXAMPLE_PREFIX):
+            shipped = resources.files("torchcloth") / "examples" / pattern.removeprefix(EXAMPLE_PREFIX)
             matches = [str(shipped)]
         else:
-            found = (m for m in sorted(glob(pattern)) if Path(m).is_dir())  # pictures may lie beside episodes
-            matches = list(found) if any(c in pattern for c in "*?[") else [pattern]
+            existing = (m for m in sorted(glob(pattern)) if Path(m).is_dir())  # pictures may lie beside episodes
+            matches = list(existing) if any(c in pattern for c in "*?[") else [pattern]
         if not matches:
             raise InvalidInput(f"config: {key}", got=f"no folder that matches {pattern}", expected="episodes")
         for folder in map(Path, matches):
@@ -72,18 +72,20 @@ def _folders(patterns: Sequence[str], key: str) -> dict[Path, Path]:
     return folders
 
 
-class Deal(Sampler[list[int]]):
-    """One process's share of the episodes of each optimiser step.
+class ShuffledEpisodeSampler(Sampler[list[int]]):
+    """Sampler of one process's share of the episodes of each optimiser step.
 
-    Step ``s`` takes the episodes ``s * per_step`` and on of an endless row of shuffles, which only the seed decides: a
-    resumed run goes on in it, and any number of processes deal out the same. Shares may differ by one.
+    The order is an infinite sequence of shuffles that depends only on the seed. Step ``s`` starts at position
+    ``s * per_step``. A resumed run therefore continues the sequence, and the order does not depend on the number of
+    processes. Shares may differ by one.
 
     Args:
-        count: of episodes.
-        per_step: of them at a step.
+        count: number of episodes.
+        per_step: number of episodes in a step.
         seed: of the shuffles.
-        step: tells how many steps were done.
-        rank, world: which process of how many.
+        step: function that returns the number of finished steps.
+        rank: index of the process.
+        world: number of processes.
     """
 
     def __init__(
@@ -94,31 +96,32 @@ class Deal(Sampler[list[int]]):
 
     def __iter__(self) -> Iterator[list[int]]:
         first = self.step() * self.per_step
-        places = range(first, first + self.per_step)
-        return iter([[self._at(place) for place in places][self.rank :: self.world]])
+        positions = range(first, first + self.per_step)
+        return iter([[self._at(position) for position in positions][self.rank :: self.world]])
 
     def __len__(self) -> int:
         return 1
 
-    def _at(self, place: int) -> int:
-        shuffle, index = divmod(place, self.count)
+    def _at(self, position: int) -> int:
+        shuffle, index = divmod(position, self.count)
         if self.per_step == self.count:
-            return index  # all at every step: their order does not matter
+            return index  # all episodes are in each step, so their order does not matter
         generator = torch.Generator().manual_seed(self.seed * 1_000_003 + shuffle)
         return int(torch.randperm(self.count, generator=generator)[index])
 
 
 class Episodes(pl.LightningDataModule):
-    """Episodes as tensors; one epoch is one optimiser step, one batch a list of episodes.
+    """Data module: one epoch is one optimiser step, and one batch is a list of episodes.
 
     Args:
-        cloth: that they are checked against.
-        train, val: recordings of it.
-        per_step: training episodes at a step; 0: all.
+        cloth: that the episodes are checked against.
+        train: recordings to train with.
+        val: recordings to validate with.
+        per_step: number of training episodes in a step; 0: all.
         seed: of their order.
 
     Raises:
-        InvalidInput: more episodes at a step than there are.
+        InvalidInput: ``per_step`` exceeds the number of episodes.
     """
 
     def __init__(
@@ -132,24 +135,27 @@ class Episodes(pl.LightningDataModule):
             raise InvalidInput("config: data.per_step", got=self.per_step, expected=expected)
 
     def train_dataloader(self) -> DataLoader:
-        """This process's share of one optimiser step."""
-        deal = Deal(len(self.train), self.per_step, self.seed, self._step, *self._place())
-        return _loader(self.train, deal)
+        """Return the loader of this process's share of one optimiser step."""
+        sampler = ShuffledEpisodeSampler(len(self.train), self.per_step, self.seed, self._step, *self._process_index())
+        return _loader(self.train, sampler)
 
     def val_dataloader(self) -> DataLoader | list[DataLoader]:
-        """This process's share of the validation episodes."""
-        return self.shared(self.val) if self.val else []
+        """Return the loader of this process's share of the validation episodes."""
+        return self.shared_loader(self.val) if self.val else []
 
-    def shared(self, episodes: list[Episode]) -> DataLoader:
-        """Every process has a share of its own, or all of them where there are too few: means stay exact."""
-        rank, world = self._place()
-        own = range(len(episodes))[rank::world] if len(episodes) >= world else range(len(episodes))
-        return _loader(episodes, [list(own)])
+    def shared_loader(self, episodes: list[Episode]) -> DataLoader:
+        """Return a loader of this process's share, or of all episodes if there are fewer than processes.
+
+        Means over all processes are exact in both cases.
+        """
+        rank, world = self._process_index()
+        selection = range(len(episodes))[rank::world] if len(episodes) >= world else range(len(episodes))
+        return _loader(episodes, [list(selection)])
 
     def _step(self) -> int:
         return 0 if self.trainer is None else self.trainer.global_step
 
-    def _place(self) -> tuple[int, int]:
+    def _process_index(self) -> tuple[int, int]:
         return (0, 1) if self.trainer is None else (self.trainer.global_rank, self.trainer.world_size)
 
 

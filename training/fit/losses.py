@@ -1,4 +1,4 @@
-"""Losses of one episode, by name: the library's residuals with Huber's function, and Chamfer distances."""
+"""Losses of one episode by name: the library's residuals with the Huber loss, and Chamfer distances."""
 
 from __future__ import annotations
 
@@ -11,21 +11,22 @@ from torch import Tensor
 from torchcloth.errors import InvalidInput
 from torchcloth.identification.residuals.blocks import BLOCKS
 from torchcloth.identification.residuals.metrics import huber
-from torchcloth.identification.residuals.rows import Scene
+from torchcloth.identification.residuals.rows import ResidualRows, SimulatedEpisode
 from torchcloth.losses import chamfer_to_vertices
-from torchcloth.losses.surface import distances
+from torchcloth.losses.surface import point_distances
 
 
 class Loss:
-    """The sum of named losses, each a mean over its observations in units of its scale.
+    """Sum of named losses, each a mean over its observations in units of its scale.
 
     Args:
-        scales: name -> what counts as 1, in the residual's unit (m, N, N m): near the noise. "points" (to the surface,
-            along its normal), "edges" (the rim), "markers", "force", "torque": residuals, quadratic up to 1.5 scales,
-            linear beyond. "chamfer_to_surface", "chamfer_to_vertices": one-sided distances from the cloud.
+        scales: scale of each loss by name, in the residual's unit (m, N, N m); choose it near the noise. "points"
+            (to the surface, along its normal), "edges" (boundary), "markers", "force" and "torque" are residuals,
+            quadratic up to 1.5 scales and linear above. "chamfer_to_surface" and "chamfer_to_vertices" are one-sided
+            distances from the cloud.
 
     Raises:
-        InvalidInput: an unknown name or a scale that is not positive.
+        InvalidInput: a name is unknown, or a scale is not positive.
     """
 
     def __init__(self, scales: Mapping[str, float]) -> None:
@@ -38,50 +39,57 @@ class Loss:
             raise InvalidInput("config: loss", got="none", expected=f"some of {', '.join(LOSSES)}")
         self.scales = dict(scales)
 
-    def __call__(self, scene: Scene) -> Tensor:
-        """Differentiable in the frames seen; what an episode does not hold is left out.
+    def __call__(self, scene: SimulatedEpisode) -> Tensor:
+        """Compute the loss of a simulated episode; losses without data are left out.
 
         Raises:
-            InvalidInput: it holds nothing that the loss asks for.
+            InvalidInput: the episode has data for none of the losses.
         """
         parts = [LOSSES[name](scene, scale) for name, scale in self.scales.items()]
-        found = [part for part in parts if part is not None]
-        if not found:
+        rows_of_block = [part for part in parts if part is not None]
+        if not rows_of_block:
             expected = f"data for {' or '.join(self.scales)}"
             raise InvalidInput(f"{scene.episode.name}: nothing to compare with", got="none of it", expected=expected)
-        return torch.stack(found).sum()
+        return torch.stack(rows_of_block).sum()
 
 
-def chamfer(scene: Scene) -> Tensor | None:
-    """One-sided Chamfer distance cloud -> surface [m], mean over the frames after the first; None without clouds."""
+def chamfer(scene: SimulatedEpisode) -> Tensor | None:
+    """Compute the one-sided Chamfer distance from cloud to surface [m], mean over the frames after the first.
+
+    None without clouds.
+    """
     frames = scene.hits.items()
-    parts = [distances(scene.episode.clouds[t], scene.seen.x[t], hits).mean() for t, hits in frames]
+    parts = [point_distances(scene.episode.clouds[t], scene.frames.x[t], hits).mean() for t, hits in frames]
     return torch.stack(parts).mean() if parts else None
 
 
-def _to_vertices(scene: Scene) -> Tensor | None:
-    frames = [chamfer_to_vertices(scene.episode.clouds[t], scene.seen.x[t]) for t in scene.hits]
+def _to_vertices(scene: SimulatedEpisode) -> Tensor | None:
+    frames = [chamfer_to_vertices(scene.episode.clouds[t], scene.frames.x[t]) for t in scene.hits]
     return torch.stack(frames).mean() if frames else None
 
 
-def _residuals(rows: Callable) -> Callable[[Scene, float], Tensor | None]:
-    def loss(scene: Scene, scale: float) -> Tensor | None:
-        found = rows(scene)
-        seen = None if found is None else found.value[found.value != 0]  # zero: a piece of the rim that was not seen
-        return None if seen is None or not len(seen) else huber(seen / scale)[0].mean()
+def _residuals(
+    rows: Callable[[SimulatedEpisode], ResidualRows | None],
+) -> Callable[[SimulatedEpisode, float], Tensor | None]:
+    def loss(scene: SimulatedEpisode, scale: float) -> Tensor | None:
+        block_rows = rows(scene)
+        if block_rows is None:
+            return None
+        observed = block_rows.residual[block_rows.residual != 0]  # zero: a part of the boundary without observation
+        return huber(observed / scale)[0].mean() if len(observed) else None
 
     return loss
 
 
-def _distance(mean: Callable[[Scene], Tensor | None]) -> Callable[[Scene, float], Tensor | None]:
-    def loss(scene: Scene, scale: float) -> Tensor | None:
-        found = mean(scene)
-        return None if found is None else found / scale
+def _distance(mean: Callable[[SimulatedEpisode], Tensor | None]) -> Callable[[SimulatedEpisode, float], Tensor | None]:
+    def loss(scene: SimulatedEpisode, scale: float) -> Tensor | None:
+        distance = mean(scene)
+        return None if distance is None else distance / scale
 
     return loss
 
 
-LOSSES: dict[str, Callable[[Scene, float], Tensor | None]] = {
+LOSSES: dict[str, Callable[[SimulatedEpisode, float], Tensor | None]] = {
     **{block.name: _residuals(block.rows) for block in BLOCKS},
     "chamfer_to_surface": _distance(chamfer),
     "chamfer_to_vertices": _distance(_to_vertices),

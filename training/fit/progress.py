@@ -1,4 +1,4 @@
-"""What a person sees while a run goes on."""
+"""Progress display of a run."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from .module import FitModule
 
 
-class Told(pl.Callback):
-    """A bar on a terminal, a line a step in a log file; only from the first process."""
+class ProgressPrinter(pl.Callback):
+    """Callback that shows a bar on a terminal, or one line for each step in a log file; first process only."""
 
     def __init__(self) -> None:
         columns = (BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), TimeRemainingColumn())
@@ -22,13 +22,13 @@ class Told(pl.Callback):
         self.task: Any = None
 
     def on_train_start(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
-        """Begin."""
+        """Start the progress bar."""
         if trainer.is_global_zero:
             self.bar.start()
             self.task = self.bar.add_task("first step", total=trainer.max_epochs, completed=trainer.global_step)
 
     def on_train_epoch_end(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
-        """One step further."""
+        """Advance by one step."""
         metrics = trainer.callback_metrics
         if self.task is None or "train/loss" not in metrics:
             return
@@ -37,7 +37,7 @@ class Told(pl.Callback):
         for kind, when in (("train", ""), *([("val", " after it")] if fresh else [])):
             if (key := f"{kind}/chamfer") in metrics:
                 parts.append(f"{kind}{when} {1e3 * float(metrics[key]):.2f} mm")
-        values = pl_module.begun if isinstance(pl_module, FitModule) else {}
+        values = pl_module.values_before if isinstance(pl_module, FitModule) else {}
         parts += [f"{name} {value:.4g}" for name, value in list(values.items())[:3]]
         text = ", ".join(parts)
         self.bar.update(self.task, completed=trainer.global_step, description=text)
@@ -45,5 +45,5 @@ class Told(pl.Callback):
             print(f"step {trainer.global_step}/{trainer.max_epochs}: {text}", flush=True)
 
     def teardown(self, trainer: pl.Trainer, pl_module: pl.LightningModule, stage: str) -> None:
-        """Leave the terminal as it was."""
+        """Stop the progress bar and restore the terminal."""
         self.bar.stop()

@@ -1,4 +1,4 @@
-"""What a run ends with: fit.json, fields.npz, and a table."""
+"""Result of a run: fit.json, fields.npz and a table."""
 
 from __future__ import annotations
 
@@ -11,23 +11,22 @@ import numpy as np
 from torchcloth._utils.files import to_json, write_atomically, write_text
 
 from .config import Config
-from .learned_cloth import summary
+from .learned_cloth import scalar_summary
 from .module import FitModule
 
-RESULTS = ("fit.json", "fields.npz")  # in a run's folder
-REMARK = (
-    "Gradient descent ends with values, not with error bars: nothing here says how well the data determine them. For "
-    "standard errors and what is identifiable, start `identify` from these values; of fields and networks there are "
-    "none."
+RESULT_FILES = ("fit.json", "fields.npz")
+NO_ERROR_BARS_REMARK = (
+    "Gradient descent gives values without error bars, so nothing here says how well the data determine them. For "
+    "standard errors and identifiability, start `identify` from these values. Fields and networks have no error bars."
 )
 CONVENTION = (
-    "SI units. chamfer: one-sided, cloud to surface: mean over frames, but the first, of the mean distance [m] from "
-    "each measured point to the nearest point of the simulated triangles; mean over the episodes. history: before each "
-    "step, values and what was seen with them; a field by its mean."
+    "SI units. chamfer: one-sided, cloud to surface: mean distance [m] from each measured point to the nearest point "
+    "of the simulated triangles, mean over all frames but the first and over the episodes. history: values before each "
+    "step and the losses with them; for a field, its mean."
 )
 
 
-def save(
+def write_result(
     folder: Path,
     config: Config,
     module: FitModule,
@@ -35,19 +34,26 @@ def save(
     figures: dict[str, Any],
     episodes: list[str],
 ) -> dict[str, Any]:
-    """Write fit.json and, where fields were learned, fields.npz; returns the content of fit.json."""
+    """Write fit.json and, if fields were learned, fields.npz.
+
+    Returns:
+        The content of fit.json.
+    """
     values, fields = module.learned.values(), {}
     parameters: dict[str, Any] = {}
     for name, value in values.items():
-        entry = {"value": summary(value), "unit": module.learned.parameter(name).unit, "initial": initial[name]}
+        entry = {"value": scalar_summary(value), "unit": module.learned.parameter(name).unit, "initial": initial[name]}
         if value.ndim:
             fields[name] = value.numpy()
-            entry |= {"field": "fields.npz", "least": float(value.min()), "largest": float(value.max())}
+            entry |= {"field": "fields.npz", "minimum": float(value.min()), "maximum": float(value.max())}
         parameters[name] = entry
     content = {
+        "schema": "torchcloth.fit/1",
         "parameters": parameters,
-        "remark": REMARK,
-        "identify": _command(config, episodes, {n: p["value"] for n, p in parameters.items() if "field" not in p}),
+        "remark": NO_ERROR_BARS_REMARK,
+        "identify_command": _identify_command(
+            config, episodes, {n: p["value"] for n, p in parameters.items() if "field" not in p}
+        ),
         **figures,
         "convention": CONVENTION,
         "history": [{"step": step, **entry} for step, entry in sorted(module.history.items())],
@@ -61,8 +67,8 @@ def save(
     return content
 
 
-def _command(config: Config, episodes: list[str], values: dict[str, float]) -> str | None:
-    """How to go on from here to error bars; None: there are no numbers to go on with."""
+def _identify_command(config: Config, episodes: list[str], values: dict[str, float]) -> str | None:
+    """Return the command that computes error bars from here; None if there are no scalars."""
     if not values:
         return None
     starts = {**config.model.start, **values}
@@ -73,17 +79,17 @@ def _command(config: Config, episodes: list[str], values: dict[str, float]) -> s
     return shlex.join(words)
 
 
-def show(content: dict[str, Any], folder: Path) -> None:
-    """The table for a person."""
+def print_result(content: dict[str, Any], folder: Path) -> None:
+    """Print the result as a table."""
     from rich.console import Console
     from rich.table import Table
 
     table = Table(title="learned", title_justify="left")
-    for column, side in (("parameter", "left"), ("unit", "left"), ("start", "right"), ("now", "right")):
+    for column, side in (("parameter", "left"), ("unit", "left"), ("start", "right"), ("fitted", "right")):
         table.add_column(column, justify=side)  # type: ignore[arg-type]
     for name, p in content["parameters"].items():
         now = f"{p['value']:.4g}"
-        now += f" (mean; {p['least']:.4g} to {p['largest']:.4g})" if "field" in p else ""
+        now += f" (mean; {p['minimum']:.4g} to {p['maximum']:.4g})" if "field" in p else ""
         table.add_row(name, p["unit"], f"{p['initial']:.4g}", now)
     console = Console()
     console.print(table)
@@ -95,6 +101,6 @@ def show(content: dict[str, Any], folder: Path) -> None:
             console.print(f"{kind}: {1e3 * after:.2f} mm from the points to the surface{start}")
     for warning in content["warnings"]:
         console.print(f"warning: {warning}", style="yellow", soft_wrap=True)
-    command = content["identify"]
-    console.print(REMARK, "" if command is None else f"\n  {command}", style="dim", soft_wrap=True)
+    command = content["identify_command"]
+    console.print(NO_ERROR_BARS_REMARK, "" if command is None else f"\n  {command}", style="dim", soft_wrap=True)
     console.print(f"result:   {folder / 'fit.json'}", soft_wrap=True)

@@ -1,4 +1,4 @@
-"""One run from config to result."""
+"""Run a fit from its configuration to its result."""
 
 from __future__ import annotations
 
@@ -25,14 +25,14 @@ from torchcloth.errors import InvalidInput, MissingDependency
 from torchcloth.identification.estimators.objective import Objective
 
 from . import result
-from .checkpoints import Whole
-from .cloth_description import built, described, precision
+from .checkpoints import AtomicCheckpointIO
+from .cloth_description import build_described_cloth, default_precision, describe_cloth
 from .config import CHECKPOINT, Config, Network, Optimizer, Run
-from .data import Episodes, found
+from .data import Episodes, read_episodes
 from .module import FitModule
-from .progress import Told
+from .progress import ProgressPrinter
 
-QUIET = (
+IGNORED_WARNINGS = (
     "does not have many workers",
     "irectory .* exists and is not empty",
     "treespec, LeafSpec",
@@ -42,19 +42,23 @@ QUIET = (
 
 
 def fit(config: Config, resume: bool = False) -> FitModule:
-    """Train, write checkpoints after every step, and the result; returns the module.
+    """Train, write a checkpoint after each step, and write the result.
 
     Args:
-        config: see ``config``.
-        resume: go on from ``out/last.ckpt``; the result is what it would have been, bit by bit.
+        config: of the run.
+        resume: continue from ``out/last.ckpt``; the result is the same, bit by bit, as without the interruption.
+
+    Returns:
+        The trained module.
 
     Raises:
-        InvalidInput: a config or data that make no run; nothing to resume, or more steps done than asked for.
-        RecordingError: an episode that cannot be trusted.
-        SimulationDiverged: a step led where nothing can be simulated, and the checkpoint is from there; or a gradient
-            that is not finite, before it is followed: the checkpoint is from the step before.
+        InvalidInput: configuration or data are inconsistent, there is nothing to resume, or more steps are done than
+            requested.
+        RecordingError: an episode is inconsistent.
+        SimulationDiverged: the simulation is unstable after a step, whose checkpoint exists; or a gradient is not
+            finite, and the checkpoint is from the step before.
     """
-    torch.set_num_threads(1)  # meshes of a thousand triangles: processes pay, threads do not
+    torch.set_num_threads(1)  # on meshes of a thousand triangles processes pay off, threads do not
     folder = config.folder
     checkpoint = folder / CHECKPOINT
     if folder.exists() and not folder.is_dir():
@@ -63,16 +67,16 @@ def fit(config: Config, resume: bool = False) -> FitModule:
         raise InvalidInput("--resume", got=f"no {checkpoint}", expected="what an interrupted run left")
     if resume:
         _check_checkpoint(checkpoint, config.optimizer.steps)
-    with precision(config.model.precision):
+    with default_precision(config.model.precision):
         return _run(config, folder, checkpoint if resume else None)
 
 
 def _check_checkpoint(checkpoint: Path, steps: int) -> None:
     try:
-        found = torch.load(checkpoint, weights_only=True)
-        whole = {"state_dict", "hyper_parameters", "history"} <= found.keys()
+        read_episodes = torch.load(checkpoint, weights_only=True)
+        whole = {"state_dict", "hyper_parameters", "history"} <= read_episodes.keys()
     except (*DAMAGED_FILE_ERRORS, AttributeError):
-        found, whole = {}, False
+        read_episodes, whole = {}, False
     if not whole:
         raise InvalidInput(
             "--resume",
@@ -80,16 +84,16 @@ def _check_checkpoint(checkpoint: Path, steps: int) -> None:
             expected="what an interrupted run left",
             remedy="start again without --resume",
         )
-    done = len(found["history"])
+    done = len(read_episodes["history"])
     if done > steps:
         raise InvalidInput("config: optimizer.steps", got=steps, expected=f"at least {done}, the steps already done")
 
 
 def _run(config: Config, folder: Path, checkpoint: Path | None) -> FitModule:
     began = time.perf_counter()
-    train, val = found(config.data)
-    description = described(train[0])
-    cloth = built(description, config.model)
+    train, val = read_episodes(config.data)
+    description = describe_cloth(train[0])
+    cloth = build_described_cloth(description, config.model)
     data = Episodes(cloth, train, val, config.data.per_step, config.run.seed)
     if config.run.processes * config.run.nodes > data.per_step:
         got, expected = config.run.processes * config.run.nodes, f"at most {data.per_step}, the episodes at a step"
@@ -98,28 +102,28 @@ def _run(config: Config, folder: Path, checkpoint: Path | None) -> FitModule:
     module = FitModule(asdict(config), description, _problem(config, cloth, data))
     _check_statistics(module.learned.network, config.run)
     initial = module.now()
-    trainer = _trainer(config, folder, [] if checkpoint else [folder / name for name in result.RESULTS])
+    trainer = _trainer(config, folder, [] if checkpoint else [folder / name for name in result.RESULT_FILES])
     trainer.fit(module, datamodule=data, ckpt_path=checkpoint)
-    trainer.loggers = []  # what is left is no step's validation, least of all of what was fitted
+    trainer.loggers = []  # the final figures belong to no step
     figures = {
-        "train": {"episodes": len(train), **_after(trainer, module, data, data.train)},
-        "val": {"episodes": len(val), **(_after(trainer, module, data, data.val) if val else {})},
+        "train": {"episodes": len(train), **_final_figures(trainer, module, data, data.train)},
+        "val": {"episodes": len(val), **(_final_figures(trainer, module, data, data.val) if val else {})},
         "steps": trainer.global_step,
         "seconds": time.perf_counter() - began,
         "processes": trainer.world_size,
-        "warnings": [doubt for e in (*data.train, *data.val) for doubt in e.data_warnings()],
+        "warnings": [warning for e in (*data.train, *data.val) for warning in e.data_warnings()],
     }
-    if data.per_step == len(train):  # else the first step told of a part of them
+    if data.per_step == len(train):  # otherwise the first step has the loss of a part of the episodes
         first = module.history[0]
         figures["train"] |= {"loss_before": first["train/loss"], "chamfer_before": first.get("train/chamfer")}
     if trainer.is_global_zero:
         episodes = [str(r.path) for r in train]
-        result.show(result.save(folder, config, module, initial, figures, episodes), folder)
+        result.print_result(result.write_result(folder, config, module, initial, figures, episodes), folder)
     return module
 
 
 def _check_statistics(network: nn.Module | None, run: Run) -> None:
-    """Of a network that remembers what it has seen, each process would remember its own share of the episodes."""
+    """Refuse running statistics on several processes, each of which would see only its share of the episodes."""
     own = () if network is None else network.modules()
     if run.processes * run.nodes > 1 and any(getattr(m, "track_running_stats", False) for m in own):
         raise InvalidInput(
@@ -130,8 +134,8 @@ def _check_statistics(network: nn.Module | None, run: Run) -> None:
 
 
 def _check_processes(run: Run) -> None:
-    """Of a launcher that starts others than the config says, each would take itself for the only one."""
-    variable = "WORLD_SIZE" if "WORLD_SIZE" in os.environ else "SLURM_NTASKS"  # torchrun's goes first, as in Lightning
+    """Refuse a launcher that starts another number of processes than the config says."""
+    variable = "WORLD_SIZE" if "WORLD_SIZE" in os.environ else "SLURM_NTASKS"  # torchrun has priority, as in Lightning
     if variable == "SLURM_NTASKS" and os.environ.get("SLURM_JOB_NAME") in ("bash", "interactive"):
         return
     started = os.environ.get(variable, "")
@@ -146,7 +150,7 @@ def _check_processes(run: Run) -> None:
 
 
 def _trainer(config: Config, folder: Path, outdated: list[Path]) -> pl.Trainer:
-    for message in QUIET:
+    for message in IGNORED_WARNINGS:
         warnings.filterwarnings("ignore", f".*{message}")
     logging.getLogger("lightning.pytorch").setLevel(logging.WARNING)
     world = config.run.processes * config.run.nodes
@@ -163,19 +167,19 @@ def _trainer(config: Config, folder: Path, outdated: list[Path]) -> pl.Trainer:
         logger=_loggers(config.run.loggers, folder),
         callbacks=[
             ModelCheckpoint(folder, Path(CHECKPOINT).stem, save_on_train_epoch_end=True, enable_version_counter=False),
-            Told(),
+            ProgressPrinter(),
         ],
-        plugins=[Whole(outdated), *_cluster()],
+        plugins=[AtomicCheckpointIO(outdated), *_cluster_plugins()],
         default_root_dir=folder,
         enable_progress_bar=False,
         enable_model_summary=False,
     )
 
 
-def _cluster() -> list[SLURMEnvironment]:
-    """SLURM's, if it started this process: what Lightning saves at its signals would be taken without --resume."""
-    alone = SLURMEnvironment.detect() and not TorchElasticEnvironment.detect()
-    return [SLURMEnvironment(auto_requeue=False)] if alone else []
+def _cluster_plugins() -> list[SLURMEnvironment]:
+    """Return SLURM's plugin without requeueing, whose checkpoints would be loaded without --resume."""
+    is_slurm_only = SLURMEnvironment.detect() and not TorchElasticEnvironment.detect()
+    return [SLURMEnvironment(auto_requeue=False)] if is_slurm_only else []
 
 
 def _loggers(names: list[str], folder: Path) -> list[Logger]:
@@ -188,14 +192,14 @@ def _loggers(names: list[str], folder: Path) -> list[Logger]:
     return out
 
 
-def _after(trainer: pl.Trainer, module: FitModule, data: Episodes, episodes: list) -> dict[str, float]:
-    """What is left, with the final values."""
-    found = trainer.validate(module, data.shared(episodes), verbose=False)[0]
-    return {f"{key.removeprefix('val/')}_after": value for key, value in found.items()}
+def _final_figures(trainer: pl.Trainer, module: FitModule, data: Episodes, episodes: list) -> dict[str, float]:
+    """Return losses and distances with the final values."""
+    read_episodes = trainer.validate(module, data.shared_loader(episodes), verbose=False)[0]
+    return {f"{key.removeprefix('val/')}_after": value for key, value in read_episodes.items()}
 
 
 def _source(network: Network | None) -> bytes:
-    """The file that a network's class stands in; empty where there is none, which making it will tell."""
+    """Return the source of a network's class; empty if there is none, which is reported when it is built."""
     try:
         spec = None if network is None else find_spec(network.module.rpartition(".")[0])
         return b"" if spec is None or not spec.has_location else Path(str(spec.origin)).read_bytes()
@@ -204,10 +208,8 @@ def _source(network: Network | None) -> bytes:
 
 
 def _problem(config: Config, cloth: Cloth, data: Episodes) -> str:
-    """Fingerprint of data, model, options and code, the library's and a network's; of what may change while a run
-    rests, nothing.
-    """
+    """Return a fingerprint of data, model, options and code, without settings that may change before a resumption."""
     fixed = replace(config, out="", run=Run(seed=config.run.seed), data=replace(config.data, train=[], val=[]))
     fixed = replace(fixed, optimizer=replace(config.optimizer, steps=Optimizer.steps))
     code = source_fingerprint(Path(__file__).resolve().parent), _source(config.learn.network)
-    return digest([*code, fixed, len(data.train), *Objective(cloth, [], [*data.train, *data.val]).identity()])
+    return digest([*code, fixed, len(data.train), *Objective(cloth, [], [*data.train, *data.val]).fingerprint_parts()])

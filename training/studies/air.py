@@ -19,12 +19,12 @@ from typing import Any
 import numpy as np
 
 from torchcloth._utils.files import write_text
-from torchcloth.diagnosis import base_model, catalogue, load_model
-from torchcloth.diagnosis.run import BASE, EXTENDED
+from torchcloth.diagnosis import build_base_model, list_hypotheses, load_model
+from torchcloth.diagnosis.run import BASE_MODEL_FILE, EXTENDED_MODEL_FILE
 from torchcloth.recordings import Recording
-from torchcloth.recordings.consistency import together
+from torchcloth.recordings.consistency import merge_scene
 
-from ..resumable import Kept
+from ..resumable import ResumableStudy
 from ..validation.realdata import swings as iri_swings
 from . import air_tables
 from .measured import VARIABLE, find, swings
@@ -44,14 +44,14 @@ def add(parser: argparse.ArgumentParser) -> None:
 def run(options: argparse.Namespace) -> None:
     """Compute what is missing, then print and draw everything."""
     source = find(options.source) / swings.SOURCE
-    kept = Kept(options.out, {"study": "air", "fast": options.fast, "source": str(source.resolve())})
+    study = ResumableStudy(options.out, {"study": "air", "fast": options.fast, "source": str(source.resolve())})
     fitted, held = swings.split(source, fast=False)
     held = held[4:5] if options.fast else held
     groups = {f"group-{k + 1}": names for k, names in enumerate(grouped(fitted)[: 1 if options.fast else GROUPS])}
     cases = {g: partial(diagnosed, source, names, options.out / g, options.fast) for g, names in groups.items()}
-    answers = kept.run(cases)
+    answers = study.run(cases)
     cases = {f"swing-{name}": partial(_predicted, source, name, options.out, list(groups)) for name in held}
-    runs = dict(zip(held, kept.run(cases).values(), strict=True))
+    runs = dict(zip(held, study.run(cases).values(), strict=True))
     labels = [f"{when} {g}" for when in ("before", "after") for g in groups]
     found = {"groups": answers, "predicted_runs": held, "predicted": pooled(summary(runs, labels), list(groups))}
     path = write_text(options.out / "air.json", json.dumps(found, indent=1, allow_nan=False) + "\n")
@@ -72,7 +72,7 @@ def diagnosed(source: Path, names: Sequence[str], folder: Path, fast: bool) -> d
     """The answer of one group; its report and models are written to the folder."""
     seconds = FAST_SECONDS if fast else SECONDS
     recordings = [beginning(source, name, seconds) for name in names]
-    asked = [h for h in catalogue(base_model(together(recordings)), recordings) if not fast or h.name in FAST_ASKED]
+    asked = [h for h in list_hypotheses(build_base_model(merge_scene(recordings)), recordings) if not fast or h.name in FAST_ASKED]
     answer = diagnosis_in(folder, recordings, hypotheses=asked)
     keys = ("verdict", "causes", "gain", "also_unexplained", "ruled_out", "undecided", "unresolvable", "parameters")
     keys = (*keys, "residual", "next_experiment")
@@ -89,8 +89,8 @@ def beginning(source: Path, name: str, seconds: float) -> Recording:
 
 def _predicted(source: Path, name: str, out: Path, groups: Sequence[str]) -> dict[str, Any]:
     worlds = {
-        f"{when} {g}": load_model(out / g / file, residual=False).world()
-        for when, file in (("before", BASE), ("after", EXTENDED))
+        f"{when} {g}": load_model(out / g / file, residual=False).build_world()
+        for when, file in (("before", BASE_MODEL_FILE), ("after", EXTENDED_MODEL_FILE))
         for g in groups
     }
     return predict(source, name, worlds)

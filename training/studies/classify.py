@@ -16,7 +16,7 @@ import numpy as np
 
 from torchcloth._utils.files import write_text
 
-from ..resumable import Kept
+from ..resumable import ResumableStudy
 from . import classification_figures
 from .fabric_tables import table
 from .fabric_trials import PAIR, stretches
@@ -41,7 +41,7 @@ class Trial(NamedTuple):
 def run(options: argparse.Namespace) -> None:
     """Compute what is missing, then print, draw and write classify.json."""
     scale = chosen(options)
-    cases = Kept(options.out, scale.settings()).run(stretches(scale))
+    cases = ResumableStudy(options.out, scale.settings()).run(stretches(scale))
     results = {title: confusion(_trials(cases.values(), names), scale.fabrics) for title, names in SETS.items()}
     content = {"what": LABEL, "paper": f'"{CLAIM}"; no table, no number', "sets": results}
     write_text(options.out / "classify.json", json.dumps(content, indent=1, allow_nan=False, ensure_ascii=False) + "\n")

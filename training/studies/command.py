@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from importlib import import_module
 from pathlib import Path
 
-from ..resumable import guarded
+from ..resumable import run_study_command
 
 # Modules of this package; ``add(parser)`` declares options, ``run(options)`` does it.
 STUDIES: tuple[str, ...] = (
@@ -32,7 +32,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Entry point; returns the exit code (0 done, 2 wrong input, 130 interrupted)."""
     options = _parser().parse_args(arguments)
     study = import_module(f".{options.study}", __package__)
-    return guarded("studies", "finished cases", lambda: study.run(options))
+    return run_study_command("studies", "finished cases", lambda: study.run(options))
 
 
 def _parser() -> argparse.ArgumentParser:

@@ -14,7 +14,7 @@ from torchcloth.episodes.unknowns import find_scalar_parameters
 from torchcloth.errors import InvalidInput
 from torchcloth.identification import identify
 
-from ..resumable import Kept
+from ..resumable import ResumableStudy
 from . import stretching
 from .manipulations import cases
 from .manipulations.console_tables import heading_table, mm, number, show, write
@@ -105,8 +105,8 @@ def run(chosen: argparse.Namespace) -> None:
             raise InvalidInput(f"--{key}", got=value, expected="a number > 0")
     scale = replace(scale, **changes)
     makers: dict[str, Callable[[Scale], Problem]] = {"sheet": sheet, "shirt": shirt}
-    kept = Kept(chosen.out, asdict(scale))
-    found = kept.run(
+    study = ResumableStudy(chosen.out, asdict(scale))
+    found = study.run(
         {
             f"{problem}-{method}": partial(_measure, makers[problem], scale, problem, method)
             for problem in chosen.problems

@@ -116,8 +116,8 @@ def _place(result: Mapping[str, Any]) -> str:
 
 def _marks(result: Mapping[str, Any]) -> list[str]:
     lines = []
-    for promise, kept in result["marks"].items():
-        judged = {name: value for name, value in kept.items() if value is not None}
+    for promise, study in result["marks"].items():
+        judged = {name: value for name, value in study.items() if value is not None}
         missed = ", ".join(FABRICS[name] for name, value in judged.items() if not value)
         lines.append(f"{promise}: {sum(judged.values())} of {len(judged)}" + (f"; not {missed}" if missed else ""))
     counts = []

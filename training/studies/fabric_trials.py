@@ -154,7 +154,7 @@ def told(fit: Identification, names: tuple[str, ...]) -> dict[str, Any]:
             "identifiable": e.identifiable,
             "says": i.statement,
             "experiment": i.experiment,
-            "tenth_mm": i.tenth_mm,
+            "tenth_mm": i.displacement_per_10_percent_mm,
         }
     return {"parameters": out, "converged": bool(fit.fit["converged"]), "warnings": fit.warnings}
 

@@ -12,7 +12,7 @@ import numpy as np
 from torchcloth._utils.files import write_text
 from torchcloth.materials.presets import find_fabric
 
-from ..resumable import Kept
+from ..resumable import ResumableStudy
 from . import fabric_figures, fabric_tables
 from .fabric_trials import DENSITIES, FAST, FULL, Scale, others, stretches, truth, values
 from .paper_fabrics import COV, FABRICS, SYMBOLS
@@ -35,7 +35,7 @@ def add(parser: argparse.ArgumentParser) -> None:
 def run(options: argparse.Namespace) -> None:
     """Compute what is missing, then print, draw and write fabrics.json."""
     scale = chosen(options)
-    cases = Kept(options.out, scale.settings()).run(stretches(scale) | others(scale))
+    cases = ResumableStudy(options.out, scale.settings()).run(stretches(scale) | others(scale))
     result = summary(scale, cases)
     write_text(options.out / "fabrics.json", json.dumps(result, indent=1, allow_nan=False, ensure_ascii=False) + "\n")
     fabric_tables.show(result)

@@ -20,15 +20,15 @@ import numpy as np
 import torch
 
 from torchcloth._utils.files import write_text
-from torchcloth.diagnosis import Hypothesis, quadratic_warm_start, base_model, begin_with, catalogue, fit, screen, prepare_data
+from torchcloth.diagnosis import Hypothesis, quadratic_warm_start, build_base_model, start_from_model, list_hypotheses, fit, screen, prepare_data
 from torchcloth.diagnosis.data.binning import align_rows
 from torchcloth.diagnosis.inference.fitting import ModelFit, assemble_fit
 from torchcloth.diagnosis.inference.linearise import Linearisation
-from torchcloth.diagnosis.run import EXTENDED
+from torchcloth.diagnosis.run import EXTENDED_MODEL_FILE
 from torchcloth.recordings import Camera, PointClouds, Recording
-from torchcloth.recordings.consistency import together
+from torchcloth.recordings.consistency import merge_scene
 
-from ..resumable import Kept
+from ..resumable import ResumableStudy
 from .fabric_tables import table
 from .measured import VARIABLE, find, swings
 from .resumable_diagnosis import diagnosis_in
@@ -87,11 +87,11 @@ def add(parser: argparse.ArgumentParser) -> None:
 def run(options: argparse.Namespace) -> None:
     """Compute what is missing, then print and write salting.json."""
     source = find(options.source) / swings.SOURCE
-    kept = Kept(options.out, {"study": "salting", "fast": options.fast, "source": str(source.resolve())})
-    found = kept.run({"all": partial(salted, source, options.fast)})["all"]
+    study = ResumableStudy(options.out, {"study": "salting", "fast": options.fast, "source": str(source.resolve())})
+    found = study.run({"all": partial(salted, source, options.fast)})["all"]
     if options.diagnose:
         labels = (PLAIN, *SALTS)
-        answers = kept.run({_file(label): partial(blind, source, label, options) for label in labels})
+        answers = study.run({_file(label): partial(blind, source, label, options) for label in labels})
         found = {**found, "diagnosed": {label: answers[_file(label)] for label in labels}}
     path = write_text(options.out / "salting.json", json.dumps(found, indent=1, allow_nan=False) + "\n")
     show(found)
@@ -101,12 +101,12 @@ def run(options: argparse.Namespace) -> None:
 def salted(source: Path, fast: bool) -> dict[str, Any]:
     """What the diagnosis says of each salt."""
     plain = [_short(swings.recording(source, name), fast) for name in RUNS[: 2 if fast else 4]]
-    model = base_model(together(plain))
-    every = catalogue(model, plain)
+    model = build_base_model(merge_scene(plain))
+    every = list_hypotheses(model, plain)
     own, asked = _named(every, OWN), [h for h in every if h.name.startswith(ASKED)]
     setting = prepare_data(model, plain)
     near, before = quadratic_warm_start(model, setting)
-    base = fit(near.plus(own, own.typical), setting, asked, before=before)
+    base = fit(near.with_hypothesis(own, own.typical), setting, asked, before=before)
     out = {}
     for label, salt in SALTS.items():
         changed = prepare_data(model, [_with(r, salt) for r in plain])
@@ -128,8 +128,8 @@ def blind(source: Path, label: str, options: argparse.Namespace) -> dict[str, An
     recordings = [_short(swings.recording(source, name), options.fast) for name in RUNS[: 2 if options.fast else 4]]
     model = None
     if label in SALTS:
-        model, recordings = begin_with(
-            options.out / _file(PLAIN) / EXTENDED, [_with(r, SALTS[label]) for r in recordings]
+        model, recordings = start_from_model(
+            options.out / _file(PLAIN) / EXTENDED_MODEL_FILE, [_with(r, SALTS[label]) for r in recordings]
         )
     answer = diagnosis_in(options.out / _file(label), recordings, model)
     return {key: answer.content[key] for key in ("verdict", "causes", "given", "also_unexplained", "undecided")}
@@ -144,8 +144,8 @@ def difference(plain: ModelFit, salted: ModelFit) -> ModelFit:
     cells, numerics = [], []
     for a, b, n in zip(plain.linearisation.bins, salted.linearisation.bins, plain.linearisation.mesh_differences, strict=True):
         both = torch.isin(a.key, b.key)
-        kept = a.select(both)
-        cells.append(kept._replace(value=align_rows(kept.key, b.key, b.value) - kept.value))
+        study = a.select(both)
+        cells.append(study._replace(value=align_rows(study.key, b.key, b.value) - study.value))
         numerics.append(torch.zeros_like(n[both]))
     evidence: Linearisation = replace(plain.linearisation, cells=cells, numerics=numerics)
     return assemble_fit(plain.model, evidence, plain.noise)
@@ -153,7 +153,7 @@ def difference(plain: ModelFit, salted: ModelFit) -> ModelFit:
 
 def _fitted(base: ModelFit, setting: Any, h: Hypothesis) -> tuple[float, float]:
     """(amplitude, standard error) of a cause beside the model."""
-    found = fit(base.model.plus(h), setting, (), ITERATIONS, noise=base.noise)
+    found = fit(base.model.with_hypothesis(h), setting, (), ITERATIONS, noise=base.noise)
     return found.model.amplitudes[-1], float(found.covariance[-1, -1].sqrt())
 
 

@@ -6,9 +6,9 @@ import torch
 from torch import Tensor
 
 from torchcloth.identification import Episode
-from torchcloth.losses import closest
+from torchcloth.losses import find_closest_points
 from torchcloth.meshes import Mesh
-from torchcloth.observe.least_squares import Equations, along_axes, solve
+from torchcloth.observe.least_squares import Equations, expand_to_axes, solve_moves
 from torchcloth.observe.shape_prior import ShapePrior
 
 ROUNDS, STRAIN = 8, 0.01  # of matching points anew; standard deviation of the strain of an edge
@@ -43,21 +43,21 @@ def registered(episode: Episode, mesh: Mesh, held: Tensor, places: Tensor, noise
     for t, cloud in enumerate(episode.clouds[1:], 1):
         x = 2 * found[-1] - found[-2] if t > 1 else found[-1].clone()
         for _ in range(ROUNDS):
-            grip = along_axes(held[:, None], x.new_ones(len(held), 1) / FAST, (places[t] - x[held]) / FAST)
-            x = x + solve([*_pulls(x, cloud, faces, noise), *grip, *prior.equations(x)], len(x))
+            grip = expand_to_axes(held[:, None], x.new_ones(len(held), 1) / FAST, (places[t] - x[held]) / FAST)
+            x = x + solve_moves([*_pulls(x, cloud, faces, noise), *grip, *prior.equations(x)], len(x))
         found.append(x)
     return torch.stack(found)
 
 
 def _pulls(x: Tensor, cloud: Tensor, faces: Tensor, noise: float) -> list[Equations]:
-    hits = closest(cloud, x, faces)
+    hits = find_closest_points(cloud, x, faces)
     a, b, c = x[hits.corners].unbind(1)
     normal = torch.nn.functional.normalize(torch.linalg.cross(b - a, c - a), dim=-1)
-    offset = cloud - hits.on(x)
+    offset = cloud - hits.interpolate(x)
     along = (offset * normal).sum(-1)
-    beside = (offset - along[:, None] * normal)[hits.beyond]
+    beside = (offset - along[:, None] * normal)[hits.is_beyond_edge]
     size = beside.norm(dim=-1).clamp(min=1e-12)
-    rim = hits.corners[hits.beyond], hits.weights[hits.beyond], beside / size[:, None], size
+    rim = hits.corners[hits.is_beyond_edge], hits.weights[hits.is_beyond_edge], beside / size[:, None], size
     out = []
     for corners, weights, direction, value in ((hits.corners, hits.weights, normal, along), rim):
         coefficients = weights[:, :, None] * direction[:, None] / noise

@@ -27,8 +27,8 @@ from torchcloth.pose import PoseEstimate, estimate_pose
 from torchcloth.pose.visibility import find_seen_vertices
 from torchcloth.recordings import Recording, read
 
-from ..resumable import Kept
-from ..validation.independent.flex_sheet import SheetSpec, bilinear
+from ..resumable import ResumableStudy
+from ..validation.independent.flex_sheet import SheetSpec, interpolate_bilinear
 from .geometric_baselines import registered, snapped
 
 DRAG = 1.2  # of the truth; its membrane has the data sheet's value
@@ -59,14 +59,14 @@ def add(parser: argparse.ArgumentParser) -> None:
 def run(options: argparse.Namespace) -> None:
     """Every motion with every model; a table, and a picture."""
     setting = FAST if options.fast else Setting()
-    kept = Kept(options.out, {"study": "pose", **{key: _plain(value) for key, value in setting._asdict().items()}})
-    kept.begin()
+    study = ResumableStudy(options.out, {"study": "pose", **{key: _plain(value) for key, value in setting._asdict().items()}})
+    study.start()
     cases: dict[str, Callable[[], dict[str, Any]]] = {}
     for motion in setting.motions:
         cases[f"{motion}, geometry"] = lambda motion=motion: _geometry(_scene(options.out, setting, motion))
         for model in setting.models:
             cases[f"{motion}, {model}"] = lambda motion=motion, model=model: _case(options.out, setting, motion, model)
-    found = kept.run(cases)
+    found = study.run(cases)
     rows = [row for name, case in found.items() for row in _rows(name, case)]
     _print(rows)
     write_text(options.out / "table.md", _markdown(rows))
@@ -111,7 +111,7 @@ def _at(recording: Recording, cloth: tc.Cloth, times: np.ndarray) -> Tensor:
     width, height = np.ptp(np.asarray(cloth.mesh.uv), axis=0)
     spec = SheetSpec(width, height, nodes=(side, side))
     frames = CubicSpline(found.t, found.vertices)(times)
-    return torch.as_tensor(np.stack([bilinear(spec, x, cloth.mesh.uv)[0] for x in frames]))
+    return torch.as_tensor(np.stack([interpolate_bilinear(spec, x, cloth.mesh.uv)[0] for x in frames]))
 
 
 def _cloth(recording: Recording, stiffness: float = 1.0, drag: float = DRAG) -> tc.Cloth:
@@ -160,7 +160,7 @@ def _geometry(scene: Scene) -> dict[str, Any]:
     cloth = _cloth(scene.recording)
     data = identification.build_episode(cloth, scene.recording)
     held = torch.cat([part.index for part in cloth.boundaries.values()])  # type: ignore[misc]
-    carried = identification.rigid_carry(data)
+    carried = identification.carry_rigidly(data)
     noise = scene.recording.observation_noise_std or 1e-3
     frames = {
         "carried rigidly": carried,
@@ -176,8 +176,8 @@ def _case(out: Path, setting: Setting, motion: str, model: str) -> dict[str, Any
     cloth, uncertain = _model(scene.recording, model)
     found = estimate_pose(cloth, scene.recording, uncertain=uncertain, modes=setting.modes, window=setting.window)
     if (motion, model) == PICTURE:
-        film = viewing.film_of_pose(scene.recording, found, truth=True)
-        viewing.picture(film, out / "pose.png", size=(520, 440))
+        film = viewing.film_from_pose(scene.recording, found, truth=True)
+        viewing.write_png(film, out / "pose.png", size=(520, 440))
     free = torch.ones(len(cloth.mesh.vertices), dtype=torch.bool)
     for part in cloth.boundaries.values():
         free[part.index] = False  # type: ignore[index]

@@ -19,21 +19,21 @@ import numpy as np
 import torch
 
 from torchcloth import planning
-from torchcloth.identification import build_cloth, fitted, identify
+from torchcloth.identification import build_cloth, load_fitted_cloth, identify
 from torchcloth.identification.io.saved_fit import RESULT
 from torchcloth.losses import chamfer_to_surface
 from torchcloth.planning import Goal
 from torchcloth.recordings import Recording
 from torchcloth.robots import replay  # pyright: ignore[reportMissingImports] - mapped from robots/ at installation
 
-from ..resumable import Kept, check_jobs
+from ..resumable import ResumableStudy, check_jobs
 from ..validation.independent import motions
-from ..validation.independent.effects import hide
-from ..validation.independent.flex_sheet import grid
-from ..validation.independent.generate import record
+from ..validation.independent.effects import add_effect
+from ..validation.independent.flex_sheet import sheet_mesh
+from ..validation.independent.generate import make_recording
 from ..validation.independent.scene import Scene as IndependentScene
 from ..validation.independent.scene import simulate
-from ..validation.independent.sensor import see
+from ..validation.independent.sensor import sample_points
 from .manipulations.console_tables import heading_table, mm, show, write
 
 FIT = "fit"
@@ -78,12 +78,12 @@ def run(options: argparse.Namespace) -> None:
     """Fit the fabric, then every case; print and write reach.json."""
     check_jobs(options.jobs)
     scale = FAST if options.fast else Scale()
-    kept = Kept(options.out, {"study": "reach", **asdict(scale)})
+    study = ResumableStudy(options.out, {"study": "reach", **asdict(scale)})
     folder = options.out / FIT
     cases: dict[str, Callable[[], dict[str, Any]]] = {FIT: partial(learn, scale, folder)}
-    found = kept.run(cases)
+    found = study.run(cases)
     cases = {f"{k}-{name}": partial(reach, scale, k, name, folder) for k, name in enumerate(scale.motions)}
-    found |= kept.run(cases, options.jobs)
+    found |= study.run(cases, options.jobs)
     show(_table(found), NOTE)
     write(options.out / "reach.json", found)
 
@@ -97,7 +97,7 @@ def scene(scale: Scale) -> Scene:
         sheet=replace(true.sheet, membrane_stiffness=WRONG["membrane_stiffness"] * true.sheet.membrane_stiffness),
         plate=replace(true.plate, stiffness=WRONG["bending_stiffness"] * true.plate.stiffness),
     )
-    return Scene(hide(true, "air.drag_n", DRAG, {}), said)
+    return Scene(add_effect(true, "air.drag_n", DRAG, {}), said)
 
 
 def learn(scale: Scale, folder: Path) -> dict[str, Any]:
@@ -116,15 +116,15 @@ def reach(scale: Scale, number: int, name: str, folder: Path) -> dict[str, Any]:
     cloth = scene(scale).true
     hidden = _elsewhere(moved, np.random.default_rng([7, number]))
     there = simulate(cloth, hidden)
-    cloud = see(cloth.sensor, cloth.sheet, hidden.t, there.x, np.random.default_rng([8, number]))
+    cloud = sample_points(cloth.sensor, cloth.sheet, hidden.t, there.x, np.random.default_rng([8, number]))
     goal = Goal(torch.as_tensor(cloud.frame(len(cloud) - 1)))
-    faces = torch.as_tensor(grid(cloth.sheet)[1])
+    faces = torch.as_tensor(sheet_mesh(cloth.sheet)[1])
     out: dict[str, Any] = {
         "noise": _from_goal(goal, there.x[-1], faces),
         "recorded": _from_goal(goal, begun.x[-1], faces) | {"vertices": _rms(begun.x[-1], there.x[-1])},
     }
     for label, how in METHODS.items():
-        model = build_cloth(episode) if label == "data sheet" else fitted(folder / RESULT, episode)[0]
+        model = build_cloth(episode) if label == "data sheet" else load_fitted_cloth(folder / RESULT, episode)[0]
         began = time.perf_counter()
         found = planning.plan(model, episode, goal, **({"iterations": scale.iterations, "wait": 0.0} | how))
         done = simulate(cloth, _along(moved, found.recording))
@@ -143,9 +143,9 @@ def reach(scale: Scale, number: int, name: str, folder: Path) -> dict[str, Any]:
 def _recorded(scale: Scale, name: str, seed: int) -> tuple[Recording, Any, Any]:
     """(recording, motion, what happened) of a motion by name."""
     cloth = scene(scale)
-    moved = motions.motion(name, cloth.true.sheet)
+    moved = motions.make_motion(name, cloth.true.sheet)
     result = simulate(cloth.true, moved)
-    said = record(cloth.true, moved, result, name, seed, scale.fit_nodes, said=cloth.said)
+    said = make_recording(cloth.true, moved, result, name, seed, scale.fit_nodes, data_sheet_scene=cloth.said)
     return replace(said, air_density=cloth.true.air.density, truth=None), moved, result
 
 
@@ -157,7 +157,7 @@ def _elsewhere(moved: Any, rng: np.random.Generator) -> Any:
     shift, angle = rng.uniform(-FAR, FAR, 3), rng.uniform(-TURN, TURN)
     shift[2] = abs(shift[2])  # up: a table may lie below
     middle = np.mean([pose[:, :3, 3] for pose in moved.pose.values()], axis=0)
-    turn = motions._about_z(share * angle)
+    turn = motions.rotations_about_z(share * angle)
     pose = {}
     for name, own in moved.pose.items():
         new = own.copy()

@@ -7,14 +7,14 @@ from pathlib import Path
 
 from torchcloth._utils.files import PROGRESS_FOLDER_NAME
 from torchcloth._utils.resume import clear_store
-from torchcloth.diagnosis import Diagnosis, Hypothesis, Model, diagnose, write_diagnosis
+from torchcloth.diagnosis import Diagnosis, Hypothesis, WorldModel, diagnose, write_diagnosis
 from torchcloth.recordings import Recording
 
 
 def diagnosis_in(
     folder: Path,
     recordings: Sequence[Recording],
-    model: Model | None = None,
+    model: WorldModel | None = None,
     hypotheses: Sequence[Hypothesis] | None = None,
 ) -> Diagnosis:
     """The answer, written to the folder; arguments and errors as in ``diagnose``."""

@@ -15,13 +15,13 @@ from pathlib import Path
 from typing import Any
 
 from torchcloth._utils.files import write_text
-from torchcloth.diagnosis import ModelFit, quadratic_warm_start, base_model, catalogue, fit, screen, prepare_data, find_bifurcating_bins
+from torchcloth.diagnosis import ModelFit, quadratic_warm_start, build_base_model, list_hypotheses, fit, screen, prepare_data, find_bifurcating_bins
 from torchcloth.diagnosis.inference.bifurcations import drop_bins
 from torchcloth.errors import InvalidInput
 from torchcloth.recordings import read
-from torchcloth.recordings.consistency import together
+from torchcloth.recordings.consistency import merge_scene
 
-from ..resumable import Kept, check_jobs
+from ..resumable import ResumableStudy, check_jobs
 from ..validation.hidden import case_sampling, make_case, reveal_truth
 from .fabric_tables import NOTHING, table
 from .screening_ablations import WAYS, rigid, tangents
@@ -41,10 +41,10 @@ def run(options: argparse.Namespace) -> None:
     """Compute what is missing, then print and write parts.json."""
     check_jobs(options.jobs)
     seeds = (*NULLS[:1], *SINGLES[:1]) if options.fast else (*NULLS, *SINGLES)
-    kept = Kept(options.out, {"study": "parts", "fast": options.fast})
-    kept.begin()
+    study = ResumableStudy(options.out, {"study": "parts", "fast": options.fast})
+    study.start()
     work = {str(seed): partial(one, options.out, seed, options.fast) for seed in seeds}
-    found = list(kept.run(work, options.jobs).values())
+    found = list(study.run(work, options.jobs).values())
     path = write_text(options.out / "parts.json", json.dumps(found, indent=1, allow_nan=False) + "\n")
     show(found)
     print(f"result: {path}")
@@ -58,16 +58,16 @@ def one(out: Path, seed: int, fast: bool) -> dict[str, Any]:
         raise InvalidInput("studies parts", got=f"case {seed} that could not be made", expected="its episodes")
     made = sorted(path for path in episodes.iterdir() if not path.name.startswith("."))  # nor what a stopped one left
     recordings = [read(path) for path in made]
-    truth = reveal_truth.truth(case_sampling.case(seed, case_sampling.SMALL if fast else case_sampling.REDUCED))
-    hidden = [e for e in truth["effects"] if e["share"] >= case_sampling.HALF]
+    truth = reveal_truth.reveal_truth(case_sampling.draw_case(seed, case_sampling.FAST_SIZE if fast else case_sampling.ROUND_SIZE))
+    hidden = [e for e in truth["effects"] if e["typical_fraction"] >= case_sampling.HALF_SIZE]
     told = {name: [_told(row) for row in screen(fit)] for name, fit in _ways(recordings).items()}
     return {"seed": seed, "family": truth["family"], "hidden": hidden, "ways": told}
 
 
 def _ways(recordings: Sequence[Any]) -> dict[str, ModelFit]:
     """The fit as a diagnosis screens it, and without each part."""
-    model = base_model(together(recordings))
-    setting, asked = prepare_data(model, recordings), catalogue(model, recordings)
+    model = build_base_model(merge_scene(recordings))
+    setting, asked = prepare_data(model, recordings), list_hypotheses(model, recordings)
     near, before = quadratic_warm_start(model, setting)
     whole = fit(near, setting, asked, before=before)
     found = drop_bins(whole, find_bifurcating_bins(whole, setting))
@@ -91,7 +91,7 @@ def show(found: Sequence[Mapping[str, Any]]) -> None:
 
     order = sorted(found, key=lambda case: bool(case["hidden"]))
     headings = (
-        "+".join(e["hypothesis"] for e in case["hidden"] if not e["beside"]) or f"{case['seed']}: {case['family']}"
+        "+".join(e["hypothesis"] for e in case["hidden"] if not e["is_enabling"]) or f"{case['seed']}: {case['family']}"
         for case in order
     )
     title = "Present, and not there or too small to matter (of what is there: amplitude asked for / truth)"
@@ -113,7 +113,7 @@ def counted(case: Mapping[str, Any], way: str) -> str:
         f"{row['amplitude'] / (e['amplitude'] * e['sign']):.2f}"
         for e in case["hidden"]
         for row in rows
-        if row["effect"] == e["hypothesis"] and e["sign"] and not e["beside"]
+        if row["effect"] == e["hypothesis"] and e["sign"] and not e["is_enabling"]
     ]
     return f"{false} ({', '.join(sizes) or NOTHING})"
 

@@ -43,7 +43,7 @@ def exact(found: ModelFit) -> ModelFit:
 
 def against_zero(found: ModelFit) -> ModelFit:
     """Any amplitude matters."""
-    anything = [replace(h, share=0.0) for h in found.linearisation.hypotheses]
+    anything = [replace(h, smallest_fraction=0.0) for h in found.linearisation.hypotheses]
     return replace(found, evidence=replace(found.linearisation, hypotheses=anything))
 
 
@@ -56,7 +56,7 @@ def one_mesh(found: ModelFit) -> ModelFit:
 
 def rigid(found: ModelFit) -> ModelFit:
     """What is fitted stays where it is, however much it could do."""
-    parameters = tuple(replace(p, std=NONE) for p in found.model.parameters)
+    parameters = tuple(replace(p, prior_std=NONE) for p in found.model.parameters)
     return assemble_fit(replace(found.model, parameters=parameters), found.linearisation, found.noise)
 
 

@@ -218,7 +218,7 @@ def _look(
     middle, depth = x[0].mean(0), float(noise.sigma(np.array(EYE)))
     eye = middle + np.array([0.0, -SIDEWAYS, EYE])
     camera = DepthCamera.azure_kinect_nfov(look_at(eye, middle, up=np.array([0.0, 1.0, 0.0])))
-    view, faces = View(camera, noise, points=detail.points), tc.meshes.rectangle(1.0, 1.0, resolution=resolution).faces
+    view, faces = View(camera, noise, max_points=detail.points), tc.meshes.rectangle(1.0, 1.0, resolution=resolution).faces
     bar = _bar(x[0], eye)
     clouds = [capture(view, frame, faces, [bar], rng=rng).points for frame in x]
     u, v = np.meshgrid(*((np.arange(n) + 0.5) / n for n in MARKERS), indexing="ij")

@@ -34,7 +34,7 @@ from torchcloth.robots import DEFAULT_JOINT_ACCELERATION, to_gripper_motion  # p
 from torchcloth.robots.primitives import GripperLimits  # pyright: ignore[reportMissingImports]
 from torchcloth.types import Trajectory
 
-from ..resumable import Kept
+from ..resumable import ResumableStudy
 from .manipulations.console_tables import heading_table, mm, show, write
 from .manipulations.scenes import TABLE_FRICTION, INITIAL_LAYER_DISTANCE_M, Discretisation, Fabric, Manipulation
 from .manipulations.scenes import Scene as Staged
@@ -103,8 +103,8 @@ def run(options: argparse.Namespace) -> None:
         if options.sac < 1:
             raise InvalidInput("--sac", got=options.sac, expected="1 or more")
         scale = Scale(**(asdict(scale) | {"sac": options.sac}))
-    kept = Kept(options.out, {"study": "trajectories", **asdict(scale)})
-    found = kept.run(
+    study = ResumableStudy(options.out, {"study": "trajectories", **asdict(scale)})
+    found = study.run(
         {
             f"{garment}-{method}": partial(sought, scale, k, garment, motion, method)
             for k, (garment, motion) in enumerate(CASES)

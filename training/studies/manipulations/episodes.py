@@ -53,9 +53,9 @@ def record(truth: Scene, model: Scene, rate: float, points: int) -> Seen:
     t = np.arange(int(end * rate + 1e-6) + 1) / rate
     x = _simulate(truth, motion, t)
     clouds, sigma, hidden = _look(what, x, truth.mesh.faces, points)
-    kept = [i for i, cloud in enumerate(clouds) if i == 0 or len(cloud) >= MIN_CLOUD_POINTS]
+    study = [i for i, cloud in enumerate(clouds) if i == 0 or len(cloud) >= MIN_CLOUD_POINTS]
     place = find_closest_points(torch.as_tensor(model.rest), torch.as_tensor(truth.rest), torch.as_tensor(truth.mesh.faces))
-    own = place.interpolate(torch.as_tensor(x[kept]))
+    own = place.interpolate(torch.as_tensor(x[study]))
     recording = rec.Recording(
         cloth=rec.ClothInfo(
             areal_density=DEFAULT_AREAL_DENSITY_KG_PER_M2,
@@ -68,7 +68,7 @@ def record(truth: Scene, model: Scene, rate: float, points: int) -> Seen:
         grasps={name: rec.GraspInfo(vertices=held) for name, held in model.held.items()},
         colliders={"table": rec.Collider(np.array([0.0, 0.0, INITIAL_LAYER_DISTANCE_M / 2]), np.array([0.0, 0.0, 1.0]))},
         points=rec.PointClouds(
-            t[kept], np.concatenate([clouds[i] for i in kept]), np.array([len(clouds[i]) for i in kept])
+            t[study], np.concatenate([clouds[i] for i in study]), np.array([len(clouds[i]) for i in study])
         ),
         observation_noise_std=sigma,
         grippers={name: to_gripper_motion(path) for name, path in motion.items()},

@@ -8,7 +8,7 @@ from dataclasses import asdict
 from functools import partial
 from typing import Any
 
-from ...resumable import Kept
+from ...resumable import ResumableStudy
 from . import study_cases
 from .cases import SOUGHT, solve_together
 from .console_tables import heading_table, number, show, write
@@ -26,9 +26,9 @@ def add(parser: argparse.ArgumentParser) -> None:
 def run(chosen: argparse.Namespace) -> None:
     """Fits, table and result."""
     setup, wanted = study_cases.chosen(chosen)
-    kept = Kept(chosen.out, asdict(setup))
+    study = ResumableStudy(chosen.out, asdict(setup))
     cases = {_name(garment, own): partial(solve_together, setup, own) for garment, own in alike(wanted).items()}
-    found = study_cases.finished(kept, cases, chosen.out) if chosen.report else kept.run(cases)
+    found = study_cases.finished(study, cases, chosen.out) if chosen.report else study.run(cases)
     show(_table(found))
     write(chosen.out / "joint.json", found)
 

@@ -11,7 +11,7 @@ from typing import Any
 
 from torchcloth.errors import InvalidInput
 
-from ...resumable import Kept
+from ...resumable import ResumableStudy
 from .cases import Setup, solve
 from .scenes import WORN, Manipulation, manipulations
 
@@ -41,19 +41,19 @@ def cases(options: argparse.Namespace) -> dict[str, dict[str, Any]]:
         InvalidInput: numbers out of range, or nothing finished to report on.
     """
     setup, wanted = chosen(options)
-    kept = Kept(options.out, asdict(setup))
+    study = ResumableStudy(options.out, asdict(setup))
     if options.report:
-        return finished(kept, [what.name for what in wanted], options.out)
-    return kept.run({what.name: partial(solve, setup, what) for what in wanted})
+        return finished(study, [what.name for what in wanted], options.out)
+    return study.run({what.name: partial(solve, setup, what) for what in wanted})
 
 
-def finished(kept: Kept, names: Iterable[str], out: Path) -> dict[str, dict[str, Any]]:
+def finished(study: ResumableStudy, names: Iterable[str], out: Path) -> dict[str, dict[str, Any]]:
     """Those of the cases that are there.
 
     Raises:
         InvalidInput: none is.
     """
-    found = {name: case for name in names if (case := kept.find(name)) is not None}
+    found = {name: case for name in names if (case := study.load_case(name)) is not None}
     if not found:
         raise InvalidInput("--report", got=f"no finished case in {out}", expected="at least one")
     return found

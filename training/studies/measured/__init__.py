@@ -17,7 +17,7 @@ from torchcloth._utils.files import write_text
 from torchcloth._utils.resume import clear_store
 from torchcloth.errors import InvalidInput
 
-from ...resumable import Kept
+from ...resumable import ResumableStudy
 from . import free_swings, measured_figures, measured_tables, sample, swing_predictions, swings, tension
 
 VARIABLE = "TORCHCLOTH_REALDATA"
@@ -32,17 +32,17 @@ def add(parser: argparse.ArgumentParser) -> None:
 def run(options: argparse.Namespace) -> None:
     """Compute what is missing, then print and draw everything."""
     source = find(options.source)
-    kept = Kept(options.out, {"study": "measured", "fast": options.fast, "source": str(source.resolve())})
+    study = ResumableStudy(options.out, {"study": "measured", "fast": options.fast, "source": str(source.resolve())})
     there = [name for name in SOURCES if (source / name).is_dir()]
     result: dict[str, Any] = {}
     if tension.NYLON in there:
-        result["nylon"] = _nylon(kept, source / tension.NYLON, options)
+        result["nylon"] = _nylon(study, source / tension.NYLON, options)
     if tension.KNITS in there:
-        result["knits"] = _knits(kept, source / tension.KNITS, options)
+        result["knits"] = _knits(study, source / tension.KNITS, options)
     if swings.SOURCE in there:
-        result["swings"] = _swings(kept, source / swings.SOURCE, options)
+        result["swings"] = _swings(study, source / swings.SOURCE, options)
     if sample.SOURCE in there:
-        result["sample"] = _sample(kept, source / sample.SOURCE, options)
+        result["sample"] = _sample(study, source / sample.SOURCE, options)
     for name in set(SOURCES) - set(there):
         print(f"{source / name} is absent: left out")
     path = write_text(options.out / "measured.json", json.dumps(result, indent=1, allow_nan=False) + "\n")
@@ -65,26 +65,26 @@ def find(given: Path | None) -> Path:
     return source
 
 
-def _nylon(kept: Kept, source: Path, options: argparse.Namespace) -> dict[str, Any]:
+def _nylon(study: ResumableStudy, source: Path, options: argparse.Namespace) -> dict[str, Any]:
     cases = {"nylon": partial(tension.nylon, source, options.out / "nylon", options.fast)}
-    found = kept.run(cases)["nylon"]
+    found = study.run(cases)["nylon"]
     measured_tables.nylon(found, options.out / "nylon")
     measured_figures.nylon(found, source, options.out / "nylon.png")
     return found
 
 
-def _knits(kept: Kept, source: Path, options: argparse.Namespace) -> dict[str, Any]:
+def _knits(study: ResumableStudy, source: Path, options: argparse.Namespace) -> dict[str, Any]:
     names = tension.fabrics(source, options.fast)
     cases = {f"knit-{name}": partial(tension.knit, source, options.out / "knits" / name, name) for name in names}
-    found = dict(zip(names, kept.run(cases).values(), strict=True))
+    found = dict(zip(names, study.run(cases).values(), strict=True))
     measured_tables.knits(found)
     measured_figures.knits(found, source, options.out / "knits.png")
     return found
 
 
-def _swings(kept: Kept, source: Path, options: argparse.Namespace) -> dict[str, Any]:
+def _swings(study: ResumableStudy, source: Path, options: argparse.Namespace) -> dict[str, Any]:
     fitted, held = swings.split(source, options.fast)
-    found = kept.run(
+    found = study.run(
         {
             "swings-whole": partial(_fit, source, fitted, options.out, options.fast),
             "swings-free": partial(free_swings.match, source, fitted, options.fast),
@@ -94,7 +94,7 @@ def _swings(kept: Kept, source: Path, options: argparse.Namespace) -> dict[str, 
     fits = {part.removeprefix("swings-"): content for part, content in found.items()}
     models = {"vacuum": dict.fromkeys(swings.NAMES, 0.0), "textbook": swings.START}
     models |= {part: content["values"] for part, content in fits.items()}
-    cases = kept.run({f"swing-{name}": partial(swing_predictions.predict, source, name, models) for name in held})
+    cases = study.run({f"swing-{name}": partial(swing_predictions.predict, source, name, models) for name in held})
     runs = dict(zip(held, cases.values(), strict=True))
     found = {
         "fitted_runs": fitted,
@@ -124,10 +124,10 @@ def _journal(out: Path) -> Path:
     return out / "progress" / "whole"
 
 
-def _sample(kept: Kept, source: Path, options: argparse.Namespace) -> dict[str, Any]:
+def _sample(study: ResumableStudy, source: Path, options: argparse.Namespace) -> dict[str, Any]:
     journal = options.out / "progress" / "sample"
     work = partial(sample.run, source, options.out / "sample", journal, options.fast)
-    found = kept.run({"sample": work})["sample"]
+    found = study.run({"sample": work})["sample"]
     clear_store(journal)
     measured_tables.sample(found)
     return found

@@ -9,7 +9,7 @@ import numpy as np
 
 from torchcloth.identification.pictures import AFTER, BEFORE, NULL, save_figure
 from torchcloth.identification.prediction_report import draw_band
-from torchcloth.identification.tension.prediction import Band
+from torchcloth.identification.tension.prediction import PredictionBand
 
 from ...validation.realdata import knits as knit_adapter
 from ...validation.realdata import nylon as nylon_adapter
@@ -19,21 +19,21 @@ from .tension import LIGHT
 TINTS = {"vacuum": NULL, "textbook": "#c9a227", "whole": AFTER, "free": BEFORE}
 
 
-def band(kept: dict[str, Any]) -> Band:
+def band(study: dict[str, Any]) -> PredictionBand:
     """From the case's JSON."""
-    return Band(*(np.array(kept[key]) for key in ("value", "std_parameters", "std_law", "std_setup")))
+    return PredictionBand(*(np.array(study[key]) for key in ("value", "std_parameters", "std_law", "std_setup")))
 
 
 def nylon(found: dict[str, Any], source: Path, path: Path) -> Path:
     """Every angle as the other three predict it."""
     figure, axes = _figure(1, len(found["left_out"]), (15, 4))
     tables = nylon_adapter.tables(source)
-    for axis, (angle, kept) in zip(axes[0], found["left_out"].items(), strict=True):
+    for axis, (angle, study) in zip(axes[0], found["left_out"].items(), strict=True):
         table = tables[int(angle)]
         axis.plot(100 * table.strain, table.force, ".", color="black", markersize=3, label="measured")
-        draw_band(axis, 100 * np.array(kept["strain"]), band(kept["force"]))
-        notes = ["outside of the fitted angles"] if any("outside" in w for w in kept["warnings"]) else []
-        notes = [f"{name} not identifiable" for name in kept["not_identifiable"]] or notes
+        draw_band(axis, 100 * np.array(study["strain"]), band(study["force"]))
+        notes = ["outside of the fitted angles"] if any("outside" in w for w in study["warnings"]) else []
+        notes = [f"{name} not identifiable" for name in study["not_identifiable"]] or notes
         axis.set_title("\n".join([f"{angle}° from the other three", *notes]), fontsize=10)
         axis.set_xlabel("strain [%]")
         axis.set_ylim(0, 1.4 * table.force.max())
@@ -51,13 +51,13 @@ def knits(found: dict[str, Any], source: Path, path: Path) -> Path:
         for tint, (one, whole) in zip(
             (AFTER, BEFORE), zip(fabric["directions"].items(), fabrics[name], strict=True), strict=True
         ):
-            label, kept = one[0], one[1]["prediction"]
-            seen = whole.rows(whole.force < LIGHT).repeats(3)
+            label, study = one[0], one[1]["prediction"]
+            seen = whole.select_rows(whole.force < LIGHT).select_repeats(3)
             for axis, kind, readings in zip(
                 column, ("force", "lateral_strain"), (seen.force, seen.lateral_strain), strict=True
             ):
                 axis.plot(100 * seen.strain, readings, ".", color=tint, markersize=4)
-                own, x = band(kept[kind]), 100 * np.array(kept["strain"])
+                own, x = band(study[kind]), 100 * np.array(study["strain"])
                 axis.fill_between(x, *own.ci95, color=tint, alpha=0.15, linewidth=0)
                 axis.plot(x, own.value, color=tint, label=f"along {label}")
         column[0].set_title(name.replace("_", " "), fontsize=9)

@@ -43,10 +43,10 @@ def run(source: Path, out: Path, journal: Path, fast: bool) -> dict[str, Any]:
         "start: 300 N/m": fit.frames_before[0],
         "fitted": fit.frames_after[0],
     }
-    kept = {key: fit.parameters["membrane_stiffness"].__dict__[key] for key in ("value", "std", "ci95", "identifiable")}
+    study = {key: fit.parameters["membrane_stiffness"].__dict__[key] for key in ("value", "std", "ci95", "identifiable")}
     return {
         "distances": {name: distances(x, data.clouds, faces) for name, x in models.items()},
-        "stiffness": kept,
+        "stiffness": study,
         "warnings": fit.warnings,
         "points": int(sum(map(len, data.clouds))),
     }

@@ -18,8 +18,8 @@ from torchcloth.cloth import Cloth
 from torchcloth.diagnosis import World
 from torchcloth.episodes.replay import Replay
 from torchcloth.episodes.streams import locate_on_pattern
-from torchcloth.identification import build_episode, rigid_carry
-from torchcloth.losses import Hits
+from torchcloth.identification import build_episode, carry_rigidly
+from torchcloth.losses import ClosestPoints
 from torchcloth.recordings import Recording
 
 from ...validation.realdata import free_swing, swings
@@ -72,15 +72,15 @@ def _lower_edge(nodes: np.ndarray) -> list[float | None]:
 def _nodes(run: Recording, model: Values | World | None) -> np.ndarray:
     """[F, 64, 3] m of a model at the run's frames; None: carried rigidly."""
     if isinstance(model, World):
-        return _hits(model.cloth).on(model.frames(build_episode(model.cloth, run)).x).numpy()
+        return _hits(model.cloth).interpolate(model.simulate_observed(build_episode(model.cloth, run)).x).numpy()
     cloth = cloth_of(run, model or START)
     data = build_episode(cloth, run)
     with torch.no_grad():
-        x = rigid_carry(data) if model is None else Replay(cloth)(data).x
-    return _hits(cloth).on(x).numpy()
+        x = carry_rigidly(data) if model is None else Replay(cloth)(data).x
+    return _hits(cloth).interpolate(x).numpy()
 
 
-def _hits(cloth: Cloth) -> Hits:
+def _hits(cloth: Cloth) -> ClosestPoints:
     """Where the camera's 8 x 8 nodes are on the sheet."""
     u = np.linspace(0, swings.SIDE, 8)
     return locate_on_pattern(cloth.mesh, np.stack(np.meshgrid(u, u, indexing="ij"), -1).reshape(-1, 2))

@@ -50,12 +50,12 @@ def recording(source: Path, name: str, every: int = 1) -> recordings.Recording:
         vertices=mesh.vertices,
         faces=mesh.faces,
         uv=mesh.uv,
-        initial_vertices=found.cloth.initial_at(mesh.uv),
+        initial_vertices=found.cloth.interpolate_initial_positions(mesh.uv),
         areal_density=DENSITY,
         areal_density_std=None,
     )
     chosen = np.arange(len(found.points)) % every == 0
-    return replace(found, cloth=cloth, points=found.points.only(chosen), path=Path(name))
+    return replace(found, cloth=cloth, points=found.points.select(chosen), path=Path(name))
 
 
 def _mesh() -> meshes.Mesh:

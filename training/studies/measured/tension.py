@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from torchcloth.identification import cross_validated, fit_tension, predict_tension, specimen_like
+from torchcloth.identification import cross_validate, fit_tension, predict_tension, make_specimen
 from torchcloth.identification.tension.model import TensionModel
 from torchcloth.recordings import ForceDisplacement
 
@@ -29,14 +29,14 @@ def nylon(source: Path, out: Path, fast: bool) -> dict[str, Any]:
     The interval of an angle that was left out takes the law's part from the others, each left out of those three.
     """
     adapter = nylon_adapter
-    tables = {angle: t.rows(slice(None, None, EVERY[fast])) for angle, t in adapter.tables(source).items()}
+    tables = {angle: t.select_rows(slice(None, None, EVERY[fast])) for angle, t in adapter.tables(source).items()}
     pulls, names = list(tables.values()), adapter.NAMES
     fit = fit_tension(adapter.start(), pulls, names)
-    *parts, whole = cross_validated(fit, adapter.start(), pulls)
+    *parts, whole = cross_validate(fit, adapter.start(), pulls)
     whole.save(out)
     left_out = {}
     for angle, part in zip(tables, parts, strict=True):
-        *_, nested = cross_validated(part, adapter.start(), [t for a, t in tables.items() if a != angle])
+        *_, nested = cross_validate(part, adapter.start(), [t for a, t in tables.items() if a != angle])
         model = nested.model
         unknown = [name for name in names if not part.parameters[name].identifiable]
         left_out[str(angle)] = predict_tension(model, tables[angle]).as_dict() | {"not_identifiable": unknown}
@@ -51,11 +51,11 @@ def nylon(source: Path, out: Path, fast: bool) -> dict[str, Any]:
 
 def at_strains(model: TensionModel, angle: float) -> list[dict[str, float]]:
     """Force of a strip at an angle [degrees] and some strains, with the parts of its error."""
-    table, std = specimen_like(model, radians(angle), strain=max(STRAINS), rows=101)
+    table, std = make_specimen(model, radians(angle), strain=max(STRAINS), rows=101)
     found = predict_tension(model, table, std).force
     low, high = found.ci95
     rows = [int(np.abs(table.strain - strain).argmin()) for strain in STRAINS]
-    parts = {"force": found.value, "parameters": found.parameters, "law": found.law, "setup": found.setup}
+    parts = {"force": found.value, "parameters": found.parameter_std, "law": found.misfit_std, "setup": found.setup_std}
     parts |= {"low": low, "high": high, "strain": table.strain}
     return [{key: float(value[i]) for key, value in parts.items()} for i in rows]
 
@@ -69,10 +69,10 @@ def fabrics(source: Path, fast: bool) -> list[str]:
 def knit(source: Path, out: Path, name: str) -> dict[str, Any]:
     """One fabric, both directions: fit of repeats 1 and 2, prediction of 3, and how far repeats are from each other."""
     adapter = knit_adapter
-    light = [table.rows(table.force < LIGHT) for table in adapter.fabrics(source)[name]]
-    fit = fit_tension(adapter.start(), [table.repeats(1, 2) for table in light], adapter.NAMES)
+    light = [table.select_rows(table.force < LIGHT) for table in adapter.fabrics(source)[name]]
+    fit = fit_tension(adapter.start(), [table.select_repeats(1, 2) for table in light], adapter.NAMES)
     fit.save(out)
-    third = [table.repeats(3) for table in light]
+    third = [table.select_repeats(3) for table in light]
     return {
         "poisson_ratio": asdict(fit.parameters["poisson_ratio"]),
         "directions": {
@@ -88,11 +88,11 @@ def floor(table: ForceDisplacement) -> dict[str, float]:
 
     No law that knows only these two pulls can be expected to come nearer.
     """
-    third, out = table.repeats(3), {}
+    third, out = table.select_repeats(3), {}
     for kind in ("force", "lateral_strain"):
         both = []
         for k in (1, 2):
-            pull = table.repeats(k)
+            pull = table.select_repeats(k)
             order = np.argsort(pull.displacement)
             values = getattr(pull, kind)[order]
             at = pull.displacement[order]
