@@ -1,4 +1,4 @@
-"""Where the cloth meets the world: grasps and colliders, applied in order. Motion is an input, never an attribute."""
+"""Grasps and colliders, applied in order. Their motion is an input of the simulation, never an attribute."""
 
 from .base import AbstractBoundary, PrescribedMotion
 from .collider import AbstractCollider
@@ -16,11 +16,11 @@ __all__ = [
     "Capsule",
     "Coulomb",
     "Cylinder",
-    "PrescribedMotion",
     "Elliptic",
     "Grasp",
     "MeshSolid",
     "Plane",
+    "PrescribedMotion",
     "Sphere",
     "Stribeck",
     "sample_trajectory",

@@ -1,4 +1,4 @@
-"""What a boundary must answer."""
+"""Base class of boundaries, and the prescribed motion that they follow."""
 
 from __future__ import annotations
 
@@ -11,33 +11,49 @@ from ..meshes import Mesh
 
 
 class PrescribedMotion(NamedTuple):
-    """A trajectory resolved on the substeps of one frame interval."""
+    """A trajectory sampled on N substeps.
 
-    increment: Tensor  # [..., N, 4, 4] rigid motion of the world points carried along during each substep
-    pose: Tensor  # [..., N, 4, 4] m, of the body at the end of each substep
-    closed: tuple[bool, ...]  # N flags
+    Attributes:
+        increment: [..., N, 4, 4], rigid motion of world points that the body carries along during each substep.
+        pose: [..., N, 4, 4] m, of the body at the end of each substep.
+        closed: N flags, the gripper holds the cloth during the substep.
+    """
+
+    increment: Tensor
+    pose: Tensor
+    closed: tuple[bool, ...]
 
 
 class AbstractBoundary(nn.Module, ABC):
-    """Changes velocities so that the constraint holds at the end of the substep.
+    """A constraint that changes velocities so that it holds at the end of the substep.
 
-    ``driven`` boundaries need a trajectory in ``motion``; the layer reports the wrench that the cloth exerts on them.
+    Attributes:
+        is_prescribed: the boundary follows a body, and needs a trajectory in ``motion``. The layer then reports the
+            wrench that the cloth exerts on the body.
     """
 
     is_prescribed: bool = False
 
     @abstractmethod
     def bind(self, mesh: Mesh) -> AbstractBoundary:
-        """Resolve what depends on the mesh (vertex indices); returns self.
+        """Resolve what depends on the mesh, such as vertex indices, and return self.
 
         Raises:
             InvalidInput: the boundary does not fit the mesh.
         """
 
     def prescribed_vertices(self, prescribed: PrescribedMotion | None, substep: int) -> Tensor | None:
-        """Indices of the vertices whose velocities it dictates whatever they are; None: of none."""
+        """Return the indices of the vertices whose velocities the boundary sets, whatever they were; None: of none."""
         return None
 
     @abstractmethod
     def constrain(self, x: Tensor, v: Tensor, dt: float, prescribed: PrescribedMotion | None, substep: int) -> Tensor:
-        """New velocities [..., V, 3] from positions at the start of the substep and velocities free of the boundary."""
+        """Return velocities that obey the boundary, [..., V, 3] m/s.
+
+        Args:
+            x: [..., V, 3] m, positions at the start of the substep.
+            v: [..., V, 3] m/s, velocities without the boundary.
+            dt: length of the substep [s].
+            prescribed: motion of the body; None: it stands still.
+            substep: row of ``prescribed``.
+        """

@@ -1,4 +1,4 @@
-"""Solid bodies that cloth cannot enter: one response for all shapes."""
+"""Solid bodies that cloth cannot enter: the response that all shapes share."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import NamedTuple, TypedDict, cast
 import torch
 from torch import Tensor
 
-from .._utils.linalg import rigid_displacement, dot, matvec, added_mass_correction
+from .._utils.linalg import added_mass_correction, dot, matvec, rigid_displacement
 from .._utils.vectors import check_has_no_gradient
 from ..errors import InvalidInput
 from ..meshes import Mesh
@@ -17,13 +17,13 @@ from .base import AbstractBoundary, PrescribedMotion
 from .friction import Coulomb
 from .points import TrianglePoints
 
-# Over the points on triangles in a substep. A cube's corner pushed into a sheet at 1 m/s, points every 5 mm, gets
-# 5.1 mm deep with one pass, 2.8 with two, 1.7 with three and with six (between the points).
+# Passes over the points on triangles in a substep. A cube's corner that is pushed into a sheet at 1 m/s, with points
+# every 5 mm, gets 5.1 mm deep with one pass, 2.8 with two, 1.7 with three and with six (between the points).
 CONTACT_PASSES = 3
 
 
 class ColliderOptions(TypedDict, total=False):
-    """What all colliders take beside shape and friction; see ``AbstractCollider``."""
+    """Keyword arguments that all colliders share; see ``AbstractCollider``."""
 
     moving: bool
     offset: float
@@ -34,24 +34,24 @@ class ColliderOptions(TypedDict, total=False):
 class AbstractCollider(AbstractBoundary):
     """A body with a signed distance. Cloth stops at its surface, sticks and slips there by dry friction.
 
-    A point may move along the normal only as far as the surface's tangent plane at the nearest place, carried along
-    with the body to the end of the substep (Signorini's condition, linearised; exact for planes). The push that this
-    needs feeds the friction, which acts on the slip against the body's material velocity. A point that is inside may
-    not go deeper and is moved out at a bounded speed, so that a bad start adds little energy. Air that moves along with
-    the cloth resists what stops it: without friction the impulse that cloth and air get together is along the surface's
-    normal, and friction is mu times that, whatever part of it the air takes.
+    A point may move along the normal only up to the tangent plane at the nearest surface point, carried along with the
+    body to the end of the substep (Signorini's condition, linearised; exact for planes). The impulse that this needs
+    determines the friction, which acts on the slip against the body's material velocity. A point that is inside may not
+    go deeper and is moved out at a bounded speed, so that a bad start adds little energy. Added mass of air resists
+    what stops the cloth. Without friction the impulse on cloth and air together is along the surface's normal, and
+    friction is mu times that impulse, whatever part of it the air takes.
 
     Args:
         friction: mu [-] of Coulomb's law, or a law: ``Coulomb``, ``Stribeck``, ``Elliptic``.
         moving: the body follows ``motion[name]``, whose pose maps the coordinates in which the shape is given to the
             world (its ``closed`` flags mean nothing here); the layer reports the wrench. Otherwise it stands still and
             the shape is given in the world.
-        offset: at which the cloth's middle surface is kept from the body [m], such as half its thickness.
+        offset: distance between the cloth's middle surface and the body [m], such as half its thickness.
         sampling: distance of contact points on the edges and triangles [m], for bodies that are smaller or sharper
-            than the mesh's edges. None: vertices alone. Between points that are L apart cloth may cut L^2 / (8 r) deep
-            into a surface of radius r and L / 3 into a sharp edge.
-        recovery: speed at which points that are inside are moved out, at most [m/s].
-        pose: [4, 4], the shape's own frame in the world, or in the body when it moves. None: no difference.
+            than the mesh's edges. None: vertices alone. Between points at a distance L cloth may cut L^2 / (8 r) deep
+            into a surface of radius r, and L / 3 into a sharp edge.
+        recovery: largest speed at which points that are inside are moved out [m/s].
+        pose: [4, 4], the shape's own frame in the world, or in the body when it moves. None: the identity.
 
     Raises:
         InvalidInput: a value outside its range.
@@ -82,24 +82,27 @@ class AbstractCollider(AbstractBoundary):
 
     @abstractmethod
     def distance(self, p: Tensor) -> tuple[Tensor, Tensor]:
-        """Signed distance [..., N, 1] m (negative inside) and outward unit normal [..., N, 3] at ``p`` [..., N, 3] m.
+        """Compute signed distance and normal at points ``p`` [..., N, 3] m in the shape's own coordinates.
 
-        In the shape's own coordinates. Finite everywhere, and so are the derivatives: at centres, axes and edges too.
+        Results and derivatives must be finite everywhere, also at centres, axes and edges.
+
+        Returns:
+            Signed distance [..., N, 1] m, negative inside, and outward unit normal [..., N, 3].
         """
 
     def clearance(self, x: Tensor, pose: Tensor | None = None) -> tuple[Tensor, Tensor]:
-        """Signed distance [..., N, 1] m and outward normal [..., N, 3] at world points ``x`` [..., N, 3] m.
+        """Compute signed distance [..., N, 1] m and outward normal [..., N, 3] at world points.
 
         Args:
-            x: positions.
-            pose: [..., 4, 4], where a moving body is; None: its coordinates are the world's.
+            x: [..., N, 3] m.
+            pose: [..., 4, 4], pose of a moving body; None: its coordinates are the world's.
         """
-        place = self._placed(None, pose)
-        distance, normal = self.distance(place.inside(x))
-        return distance, place.outwards(normal)
+        frame = self._frame(None, pose)
+        distance, normal = self.distance(frame.to_shape(x))
+        return distance, frame.vectors_to_world(normal)
 
     def bind(self, mesh: Mesh) -> AbstractCollider:
-        """Lay the contact points on the mesh."""
+        """Lay the contact points on the mesh, and return self."""
         if self.sampling is not None:
             self.points = TrianglePoints(mesh, self.sampling).to(self.friction.raw.device)
         return self
@@ -114,114 +117,153 @@ class AbstractCollider(AbstractBoundary):
         added_mass_ratio: Tensor | None = None,
         mass: Tensor | None = None,
     ) -> Tensor:
-        """Stop what approaches; first the points on edges and triangles, then, exactly, the vertices.
+        """Stop what approaches the body: first points on edges and triangles, then, exactly, the vertices.
 
-        ``resistance`` [..., V, 3, 3] is the mass of the air that moves along, over the vertices' own; None: none does.
-        ``mass`` [..., V, 1] of the vertices, in any unit; None: all have the same.
+        Args:
+            x: as for every boundary.
+            v: as for every boundary.
+            dt: as for every boundary.
+            prescribed: as for every boundary.
+            substep: as for every boundary.
+            added_mass_ratio: [..., V, 3, 3], mass of the air that moves along over the vertices' own; None: no air.
+            mass: [..., V, 1], vertex masses in any unit; None: all are equal.
         """
-        motion = (None, None) if prescribed is None else (d[..., substep, :, :] for d in (prescribed.increment, prescribed.pose))
-        place = self._placed(*motion)
+        increment = pose = None
+        if prescribed is not None:
+            increment, pose = prescribed.increment[..., substep, :, :], prescribed.pose[..., substep, :, :]
+        frame = self._frame(increment, pose)
         if self.points is not None:
-            air = None if added_mass_ratio is None else self.points.interpolate(added_mass_ratio.flatten(-2)).unflatten(-1, (3, 3))
-            contact = self._contact(self.points.interpolate(x), dt, place, air)
+            ratio = added_mass_ratio
+            ratio = None if ratio is None else self.points.interpolate(ratio.flatten(-2)).unflatten(-1, (3, 3))
+            contact = self._contact(self.points.interpolate(x), dt, frame, ratio)
             mass = torch.ones_like(v[..., :1]) if mass is None else mass
             for _ in range(CONTACT_PASSES):
-                v = v + self.points.distribute(self._change(contact, self.points.interpolate(v)), mass)
-        return v + self._change(self._contact(x, dt, place, added_mass_ratio), v)
+                change = self._velocity_change(contact, self.points.interpolate(v))
+                v = v + self.points.distribute(change, mass)
+        return v + self._velocity_change(self._contact(x, dt, frame, added_mass_ratio), v)
 
-    def _placed(self, increment: Tensor | None, pose: Tensor | None) -> _Place:
-        own = self.pose
-        return _Place(increment, own if pose is None else pose if own is None else pose @ own)
+    def _frame(self, increment: Tensor | None, body_pose: Tensor | None) -> _ShapeFrame:
+        pose = self.pose if body_pose is None else body_pose if self.pose is None else body_pose @ self.pose
+        return _ShapeFrame(increment, pose)
 
-    def _contact(self, x: Tensor, dt: float, place: _Place, resistance: Tensor | None) -> _Contact:
-        way = place.way(x)
-        distance, normal = self.distance(place.inside(x if way is None else x + way))
-        least = ((self.offset - distance) / dt).clamp(max=self.recovery)
-        air = None if resistance is None else _Air.of(place.tensor_inwards(resistance), normal)
-        return _Contact(place, None if way is None else way / dt, normal, least, air)
+    def _contact(self, x: Tensor, dt: float, frame: _ShapeFrame, added_mass_ratio: Tensor | None) -> _Contact:
+        carried = frame.body_displacement(x)
+        distance, normal = self.distance(frame.to_shape(x if carried is None else x + carried))
+        min_speed = ((self.offset - distance) / dt).clamp(max=self.recovery)
+        air = None
+        if added_mass_ratio is not None:
+            air = _AirResponse.to_impulse_along(frame.tensors_to_shape(added_mass_ratio), normal)
+        return _Contact(frame, None if carried is None else carried / dt, normal, min_speed, air)
 
-    def _change(self, contact: _Contact, v: Tensor) -> Tensor:
-        """Change of velocity of points [..., N, 3], exactly 0 for those that are free."""
-        place, own, normal, least, air = contact
-        slip = place.inwards(v if own is None else v - own)
+    def _velocity_change(self, contact: _Contact, v: Tensor) -> Tensor:
+        """Return the change of velocity of points [..., N, 3], exactly 0 for those that are free."""
+        frame, body_velocity, normal, min_speed, air = contact
+        slip = frame.vectors_to_shape(v if body_velocity is None else v - body_velocity)
         approach = dot(slip, normal)
-        push = (least - approach).clamp(min=0)
+        push = (min_speed - approach).clamp(min=0)
         slip = slip - approach * normal
         if air is None:
-            return place.outwards(push * normal - self.friction.slip_reduction(slip, push) * slip)
-        aside = push * air.aside
-        slip = slip + aside
-        taken = self.friction.slip_reduction(slip, push * air.pushed(slip))
-        return place.outwards(push * normal + aside - taken * slip)
+            return frame.vectors_to_world(push * normal - self.friction.slip_reduction(slip, push) * slip)
+        sideways = push * air.sideways
+        slip = slip + sideways
+        reduction = self.friction.slip_reduction(slip, push * air.friction_push(slip))
+        return frame.vectors_to_world(push * normal + sideways - reduction * slip)
 
     def extra_repr(self) -> str:
-        """One line of the data sheet."""
+        """Return the line of the data sheet: motion, offset and contact points."""
         sampled = "vertices" if self.sampling is None else f"points every {self.sampling:g} m"
         return f"{'moving' if self.is_prescribed else 'fixed'}, offset={self.offset:g} m, {sampled}"
 
 
-class _Place(NamedTuple):
-    """Where the shape is at the end of a substep; None for what makes no difference."""
+class _ShapeFrame(NamedTuple):
+    """Frame of the shape at the end of a substep; None stands for the identity.
 
-    increment: Tensor | None  # [..., 4, 4] motion of the world points that the body carries along
-    pose: Tensor | None  # [..., 4, 4] of the shape
+    Attributes:
+        increment: [..., 4, 4], motion of the world points that the body carries along during the substep.
+        pose: [..., 4, 4], of the shape in the world.
+    """
 
-    def way(self, x: Tensor) -> Tensor | None:
-        """How far the body's motion carries world points; None: it stands still."""
+    increment: Tensor | None
+    pose: Tensor | None
+
+    def body_displacement(self, x: Tensor) -> Tensor | None:
+        """Return how far the body's motion carries world points [..., N, 3] m; None: it stands still."""
         return None if self.increment is None else rigid_displacement(self.increment, x)
 
-    def inside(self, x: Tensor) -> Tensor:
-        """World points in the shape's coordinates."""
+    def to_shape(self, x: Tensor) -> Tensor:
+        """Return world points in the shape's coordinates."""
         if self.pose is None:
             return x
-        away = x - self.pose[..., None, :3, 3]  # no matrix product: CUDA's may have ten bits, half a millimetre at 1 m
-        return (away.unsqueeze(-1) * self.pose[..., None, :3, :3]).sum(-2)
+        offset = x - self.pose[..., None, :3, 3]
+        # no matrix product: on CUDA it may have ten bits, which is half a millimetre at 1 m
+        return (offset.unsqueeze(-1) * self.pose[..., None, :3, :3]).sum(-2)
 
-    def inwards(self, v: Tensor) -> Tensor:
-        """World vectors in the shape's axes."""
+    def vectors_to_shape(self, v: Tensor) -> Tensor:
+        """Return world vectors in the shape's axes."""
         return v if self.pose is None else v @ self.pose[..., :3, :3]
 
-    def tensor_inwards(self, b: Tensor) -> Tensor:
-        """World tensors [..., N, 3, 3] in the shape's axes."""
+    def tensors_to_shape(self, b: Tensor) -> Tensor:
+        """Return world tensors [..., N, 3, 3] in the shape's axes."""
         if self.pose is None:
             return b
-        turn = self.pose[..., None, :3, :3]
-        return turn.mT @ b @ turn
+        rotation = self.pose[..., None, :3, :3]
+        return rotation.mT @ b @ rotation
 
-    def outwards(self, v: Tensor) -> Tensor:
-        """Vectors of the shape in world axes."""
+    def vectors_to_world(self, v: Tensor) -> Tensor:
+        """Return vectors of the shape's axes in world axes."""
         return v if self.pose is None else v @ self.pose[..., :3, :3].mT
 
 
 class _Contact(NamedTuple):
-    """What does not depend on the points' velocities."""
+    """What does not depend on the points' velocities.
 
-    place: _Place
-    own: Tensor | None  # [..., N, 3] m/s, material velocity of the body, world axes; None: it stands still
-    normal: Tensor  # [..., N, 3], the shape's axes
-    least: Tensor  # [..., N, 1] m/s, normal velocity that the points must have at least, relative to the body
-    air: _Air | None  # that moves along; None: there is none
+    Attributes:
+        frame: the shape's frame.
+        body_velocity: [..., N, 3] m/s, material velocity of the body in world axes; None: it stands still.
+        normal: [..., N, 3], in the shape's axes.
+        min_speed: [..., N, 1] m/s, smallest allowed velocity along the normal relative to the body.
+        air: response of the added mass; None: no air.
+    """
+
+    frame: _ShapeFrame
+    body_velocity: Tensor | None
+    normal: Tensor
+    min_speed: Tensor
+    air: _AirResponse | None
 
 
-class _Air(NamedTuple):
-    """How points with air that moves along answer a push, in the shape's axes."""
+class _AirResponse(NamedTuple):
+    """How points with added mass respond to an impulse along the normal, in the shape's axes.
 
-    resistance: Tensor  # [..., N, 3, 3]
-    aside: Tensor  # [..., N, 3], tangential, change of velocity with one of 1 along the normal: sheets give way aslant
-    push: Tensor  # [..., N, 1], impulse per mass that such a change takes
+    Attributes:
+        added_mass_ratio: [..., N, 3, 3].
+        sideways: [..., N, 3], tangential change of velocity for a unit change along the normal. It is not zero, because
+            the air has inertia along the sheet's normal only.
+        push: [..., N, 1], impulse per mass for such a change.
+    """
+
+    added_mass_ratio: Tensor
+    sideways: Tensor
+    push: Tensor
 
     @classmethod
-    def of(cls, resistance: Tensor, normal: Tensor) -> _Air:
-        """W n = n - (1 + B)^-1 B n answers the impulse n: over n . W n, what changes the normal velocity by 1."""
-        less = added_mass_correction(resistance, normal)
-        along = dot(less, normal)
-        push = 1 / (1 - along)
-        return cls(resistance, push * (along * normal - less), push)
+    def to_impulse_along(cls, added_mass_ratio: Tensor, normal: Tensor) -> _AirResponse:
+        """Solve for the response: the impulse n changes the velocity by W n = n - (1 + B)^-1 B n.
 
-    def pushed(self, slip: Tensor) -> Tensor:
-        """Push that counts for friction, of 1: as inertia along the normal is more, and along the slip [..., N, 3]."""
+        Divided by n . W n, it changes the normal velocity by 1.
+        """
+        correction = added_mass_correction(added_mass_ratio, normal)
+        along = dot(correction, normal)
+        push = 1 / (1 - along)
+        return cls(added_mass_ratio, push * (along * normal - correction), push)
+
+    def friction_push(self, slip: Tensor) -> Tensor:
+        """Return the push that counts for friction per unit of push, [..., N, 1].
+
+        Inertia along the normal makes it larger, inertia along the slip smaller.
+        """
         squared = dot(slip, slip)
-        along = dot(slip, matvec(self.resistance, slip))
+        along = dot(slip, matvec(self.added_mass_ratio, slip))
         return self.push / (1 + along / torch.where(squared > 0, squared, 1.0))
 
 

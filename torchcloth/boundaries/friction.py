@@ -1,4 +1,4 @@
-"""Dry friction: how much of the slip a push along the normal takes away."""
+"""Laws of dry friction: by how much an impulse along the normal reduces the slip."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from ..parameters import PhysicalParameter
 
 
 class Coulomb(PhysicalParameter):
-    """Coulomb's law, stick and slip: the tangential impulse is at most mu times the normal one.
+    """Coulomb's law with stick and slip: the tangential impulse is at most mu times the normal one.
 
     Args:
         friction: mu [-], >= 0; a batch is [B, 1].
@@ -28,7 +28,7 @@ class Coulomb(PhysicalParameter):
         check_scalar("friction", self)
 
     def slip_reduction(self, slip: Tensor, push: Tensor) -> Tensor:
-        """Share of the slip that is lost [..., N, 1]; 1 where the surfaces stick.
+        """Return the fraction of the slip that friction removes, [..., N, 1]; 1 where the surfaces stick.
 
         Args:
             slip: [..., N, 3] m/s, tangential velocity relative to the body before friction, in the body's axes.
@@ -40,7 +40,6 @@ class Coulomb(PhysicalParameter):
         return torch.where(sticks, 1.0, limit / torch.where(size > 0, size, 1.0))
 
     def _size(self, slip: Tensor) -> Tensor:
-        """The length of the slip that is compared with mu times the push."""
         return safe_norm(slip)
 
     def _coefficient(self, size: Tensor) -> Tensor:
@@ -50,7 +49,7 @@ class Coulomb(PhysicalParameter):
 class Stribeck(Coulomb):
     """Friction that falls with the speed: mu = kinetic + (static - kinetic) exp(-(|slip| / speed)^2).
 
-    ``static == kinetic`` is Coulomb's law, bitwise. The law of Stribeck 1902 in the form of Bo and Pavelescu 1982.
+    ``static == kinetic`` is Coulomb's law, bitwise. Stribeck 1902, in the form of Bo and Pavelescu 1982.
 
     Args:
         kinetic: mu of fast slip [-], >= 0.
@@ -67,16 +66,16 @@ class Stribeck(Coulomb):
         self.speed = PhysicalParameter(speed, "m/s", name="speed of the Stribeck law")
 
     def _coefficient(self, size: Tensor) -> Tensor:
-        fall = torch.exp(-((size / per_point(self.speed.value)) ** 2))
-        return per_point(self.value) + per_point(self.excess.value) * fall
+        decay = torch.exp(-((size / per_point(self.speed.value)) ** 2))
+        return per_point(self.value) + per_point(self.excess.value) * decay
 
 
 class Elliptic(Coulomb):
-    """Friction that depends on the direction of slip: an elliptical cone, made for planes.
+    """Friction that depends on the direction of slip: an elliptical cone, for planes.
 
-    Not associated: the force opposes the slip, with the size of the cone in that direction; slip is never deflected.
-    ``across == along`` is Coulomb's law, bitwise. Where another solid's surface is not along the axis, what of the slip
-    is along the axis counts as along, so that all slip is across where the axis is the surface's normal.
+    The law is not associated: the force opposes the slip, with the size of the cone in that direction, and slip is
+    never deflected. ``across == along`` is Coulomb's law, bitwise. On other solids the part of the slip along the axis
+    counts as along. Where the axis is the surface's normal, all slip is across.
 
     Args:
         along: mu of slip along ``axis`` [-], > 0; a batch is [B, 1].
@@ -101,11 +100,15 @@ class Elliptic(Coulomb):
 
 
 def check_scalar(name: str, parameter: PhysicalParameter) -> None:
-    """Refuse what is not one number of a body, or of each of a batch."""
+    """Check that a parameter is a scalar or a batch of scalars [B, 1].
+
+    Raises:
+        InvalidInput: another shape.
+    """
     if parameter.raw.ndim and parameter.raw.shape[-1] != 1:
         raise InvalidInput(name, got=f"shape {tuple(parameter.raw.shape)}", expected="a scalar or [B, 1]")
 
 
 def per_point(value: Tensor) -> Tensor:
-    """A body's scalar [] or batch [..., 1] as it meets points [..., N, 1]."""
+    """Return a scalar [] or batch [..., 1] of a body, to broadcast with points [..., N, 1]."""
     return value.unsqueeze(-1) if value.ndim else value

@@ -1,4 +1,4 @@
-"""A gripper that holds a patch of cloth."""
+"""A gripper that grips a patch of cloth."""
 
 from __future__ import annotations
 
@@ -22,16 +22,16 @@ Corner = Literal["lower-left", "lower-right", "upper-left", "upper-right"]
 class Grasp(AbstractBoundary):
     """Vertices that follow an end effector rigidly while it is closed.
 
-    Every substep applies the body's own increment of motion to the held vertices, so nothing has to be remembered from
-    the moment of closing, and nothing drifts.
+    Every substep applies the body's increment of motion to the gripped vertices. So nothing has to be stored at the
+    time of closing, and nothing drifts.
 
     Args:
-        vertices: indices of the held vertices; or
-        uv: [G, 2] m pattern coordinates of patch centres, with
+        vertices: indices of the gripped vertices; or
+        uv: [G, 2] m, pattern coordinates of patch centres, with
         radius: of the patch [m].
 
     Raises:
-        InvalidInput: both or neither of vertices and uv; a patch that holds no vertex.
+        InvalidInput: both or neither of vertices and uv; a patch without vertices.
     """
 
     is_prescribed = True
@@ -42,7 +42,7 @@ class Grasp(AbstractBoundary):
         super().__init__()
         if (vertices is None) == (uv is None):
             raise InvalidInput("Grasp", got="both or neither of vertices and uv", expected="exactly one of them")
-        self._uv, self.radius, self._stays = None if uv is None else _centres(uv), float(radius), False
+        self._uv, self.radius, self._has_fixed_vertices = None if uv is None else _centres(uv), float(radius), False
         self._corner: Corner | None = None
         self._place: str | None = None
         self.register_buffer("index", _indices([] if vertices is None else vertices), persistent=False)
@@ -50,7 +50,11 @@ class Grasp(AbstractBoundary):
 
     @classmethod
     def corner(cls, corner: Corner, radius: float = 0.015) -> Grasp:
-        """The patch at a corner of the pattern's bounding box: "lower-left", "upper-right", ..."""
+        """Build a grasp of the patch at a corner of the pattern's bounding box, such as "lower-left".
+
+        Raises:
+            InvalidInput: no such corner.
+        """
         if corner not in ("lower-left", "lower-right", "upper-left", "upper-right"):
             raise InvalidInput(
                 "corner", got=repr(corner), expected='"lower-left", "lower-right", "upper-left" or "upper-right"'
@@ -61,9 +65,9 @@ class Grasp(AbstractBoundary):
 
     @classmethod
     def at(cls, place: str, radius: float = 0.015) -> Grasp:
-        """The vertices of a named place of the mesh, such as "left shoulder", and those within ``radius`` [m] of it.
+        """Build a grasp of a named place of the mesh, such as "left shoulder", and of what lies within ``radius`` [m].
 
-        Layers that lie on each other are pinched together; see ``mesh.places`` for the names.
+        Layers that lie on each other are pinched together. ``mesh.places`` has the names.
         """
         grasp = cls(vertices=[], radius=radius)
         grasp._place = place
@@ -71,28 +75,36 @@ class Grasp(AbstractBoundary):
 
     @property
     def uv(self) -> np.ndarray | None:
-        """[G, 2] m, pattern coordinates of the patch's centres; None where it is known by its vertices or its name.
+        """Pattern coordinates [G, 2] m of the patch's centres; None for a patch given by vertices or by name.
 
-        Of a ``corner``, once it is bound to a mesh.
+        A ``corner`` has them once it is bound to a mesh.
         """
         return None if self._uv is None else np.atleast_2d(self._uv)
 
     def shifted(self, wider: float, along: float) -> Grasp:
-        """The same vertices, where a mesh has them ``wider`` [m] farther out and ``along`` [m] further along u."""
+        """Return a grasp of the same vertices, for a mesh whose patch is ``wider`` and shifted ``along`` u, both in m.
+
+        Raises:
+            InvalidInput: a patch that was not given by uv.
+        """
         if self.uv is None:
             raise InvalidInput("Grasp.moved", got="a patch without a place", expected="one that was given by uv")
         return Grasp(uv=self.uv + np.array([along, 0.0]), radius=self.radius + wider).with_vertices(self.index)
 
     def with_vertices(self, vertices: Tensor) -> Grasp:
-        """The same patch or place with these vertices [H] in it, whatever a mesh has there."""
+        """Return the same patch or place with the vertices [H] in it, whatever a mesh has there."""
         grasp = copy.deepcopy(self)
-        grasp.index, grasp._stays = vertices.clone(), True
+        grasp.index, grasp._has_fixed_vertices = vertices.clone(), True
         return grasp
 
     def bind(self, mesh: Mesh) -> Grasp:
-        """Find the held vertices in the mesh's pattern coordinates, or among its places."""
-        if not self._stays:
-            self._find(mesh)
+        """Find the gripped vertices by the mesh's pattern coordinates or places, and return self.
+
+        Raises:
+            InvalidInput: no vertex, or vertices that the mesh does not have.
+        """
+        if not self._has_fixed_vertices:
+            self._find_vertices(mesh)
         self.index = self.index.unique()  # a vertex named twice would count twice in the wrench
         if len(self.index) == 0 or int(self.index.min()) < 0 or int(self.index.max()) >= len(mesh.vertices):
             raise InvalidInput(
@@ -102,7 +114,7 @@ class Grasp(AbstractBoundary):
             )
         return self
 
-    def _find(self, mesh: Mesh) -> None:
+    def _find_vertices(self, mesh: Mesh) -> None:
         if self._place is not None:
             self.index = torch.as_tensor(mesh.vertices_at_place(self._place, self.radius), device=self.index.device)
         if self._corner is not None:
@@ -116,45 +128,47 @@ class Grasp(AbstractBoundary):
             vertical, horizontal = self._corner.split("-")
             self._uv = [[(low if horizontal == "left" else high)[0], (low if vertical == "lower" else high)[1]]]
         if self._uv is not None:
-            self.index = torch.as_tensor(mesh.vertices_near_pattern_points(self._uv, self.radius), device=self.index.device)
+            self.index = torch.as_tensor(
+                mesh.vertices_near_pattern_points(self._uv, self.radius), device=self.index.device
+            )
 
     def prescribed_vertices(self, prescribed: PrescribedMotion | None, substep: int) -> Tensor | None:
-        """All while it is closed."""
+        """Return all gripped vertices while the gripper is closed, else None."""
         return self.index if prescribed is not None and prescribed.closed[substep] else None
 
     def constrain(self, x: Tensor, v: Tensor, dt: float, prescribed: PrescribedMotion | None, substep: int) -> Tensor:
-        """Held vertices arrive exactly where the body carries them."""
+        """Set the velocities of gripped vertices so that they arrive exactly where the body carries them."""
         if prescribed is None or self.prescribed_vertices(prescribed, substep) is None:
             return v
-        wanted = rigid_displacement(prescribed.increment[..., substep, :, :], x.index_select(-2, self.index)) / dt
-        v = v.expand(*wanted.shape[:-2], *v.shape[-2:])
-        return v.index_copy(-2, self.index, wanted)
+        gripped = x.index_select(-2, self.index)
+        velocity = rigid_displacement(prescribed.increment[..., substep, :, :], gripped) / dt
+        v = v.expand(*velocity.shape[:-2], *v.shape[-2:])
+        return v.index_copy(-2, self.index, velocity)
 
     def extra_repr(self) -> str:
-        """One line of the data sheet."""
+        """Return the line of the data sheet: number of vertices."""
         return f"{len(self.index)} vertices"
 
 
 def _centres(uv: ArrayLike) -> np.ndarray:
-    """[G, 2]"""
     try:
-        found = np.atleast_2d(np.asarray(uv, dtype=float))
+        centres = np.atleast_2d(np.asarray(uv, dtype=float))
     except (TypeError, ValueError, RuntimeError) as error:
         raise InvalidInput("Grasp uv", got=f"{uv!r}"[:60], expected="pattern points [G, 2] in metres") from error
-    if found.ndim != 2 or found.shape[1] != 2 or not len(found) or not np.isfinite(found).all():
+    if centres.ndim != 2 or centres.shape[1] != 2 or not len(centres) or not np.isfinite(centres).all():
         got = f"shape {np.shape(uv)}"
         raise InvalidInput("Grasp uv", got=got, expected="finite pattern points [G, 2] in metres")
-    return found
+    return centres
 
 
 def _indices(vertices: Sequence[int]) -> Tensor:
-    """[H] int64. Truths and shares would pass for the numbers 0 and 1."""
-    found = np.asarray(vertices.cpu() if isinstance(vertices, Tensor) else vertices)
-    if found.ndim != 1 or (len(found) and found.dtype.kind not in "iu"):
+    """Return indices [H] int64; booleans and fractions, which would be taken for 0 and 1, are refused."""
+    indices = np.asarray(vertices.cpu() if isinstance(vertices, Tensor) else vertices)
+    if indices.ndim != 1 or (len(indices) and indices.dtype.kind not in "iu"):
         raise InvalidInput(
             "Grasp vertices",
-            got=f"{found.dtype} of shape {found.shape}",
+            got=f"{indices.dtype} of shape {indices.shape}",
             expected="numbers of vertices",
             remedy="of a mask numpy.flatnonzero(mask)",
         )
-    return torch.as_tensor(found.astype(np.int64))
+    return torch.as_tensor(indices.astype(np.int64))

@@ -16,20 +16,20 @@ from ..meshes.topology import find_edges
 from .collider import AbstractCollider, ColliderOptions
 from .friction import Coulomb
 
-GRID_MARGIN_CELLS = 2  # cells of the grid around the solid
-MAX_GRID_NODES = 2**25  # nodes of the grid: 256 MiB in float64
+GRID_MARGIN_CELLS = 2  # around the solid
+MAX_GRID_NODES = 2**25  # 256 MiB in float64
 
 
 class MeshSolid(AbstractCollider):
-    """The inside of a closed triangle mesh; its signed distance is kept on a regular grid.
+    """The inside of a closed triangle mesh, with its signed distance on a regular grid.
 
-    The distance is interpolated trilinearly and the normal is the direction of the interpolant's own gradient.
-    Edges are rounded to about one cell; parts thinner than two cells are lost.
+    The distance is interpolated trilinearly, and the normal is the direction of the interpolant's gradient. Edges are
+    rounded to about one cell; parts thinner than two cells vanish.
 
     Args:
         vertices: [V, 3] m.
         faces: [F, 3] triangles, each edge shared by exactly two.
-        cell: of the grid [m]; None: a 48th of the longest extent. Memory grows with its inverse cubed.
+        cell: cell of the grid [m]; None: a 48th of the longest extent. Memory grows with its inverse cubed.
         pose: [4, 4], of the mesh in the world, or in the body when it moves. None: as the vertices say.
         friction: Coulomb coefficient >= 0, or a law.
         options: as for every collider (``AbstractCollider``).
@@ -78,18 +78,21 @@ class MeshSolid(AbstractCollider):
         self.count: Tensor
 
     def distance(self, p: Tensor) -> tuple[Tensor, Tensor]:
-        """Interpolated; beyond the grid the distance to it is added. Where the gradient vanishes: the z axis."""
-        place = (p - self.origin) / self.cell
-        kept = torch.minimum(place.clamp(min=0), (self.count - 1).to(place))
-        first = torch.minimum(kept.detach().nan_to_num().long().clamp(min=0), self.count - 2)  # of lost states, too
-        value, gradient = self._interpolate(first, kept - first)
+        """Interpolate distance and normal; outside the grid the distance to it is added.
+
+        Where the gradient vanishes the normal is the z axis.
+        """
+        position = (p - self.origin) / self.cell
+        inside = torch.minimum(position.clamp(min=0), (self.count - 1).to(position))
+        first = torch.minimum(inside.detach().nan_to_num().long().clamp(min=0), self.count - 2)  # diverged states too
+        value, gradient = self._interpolate(first, inside - first)
         length = safe_norm(gradient)
         flat = length < 1e-3
         normal = torch.where(flat, self.up, gradient / torch.where(flat, 1.0, length))
-        return value + self.cell * safe_norm(place - kept), normal
+        return value + self.cell * safe_norm(position - inside), normal
 
     def _interpolate(self, first: Tensor, t: Tensor) -> tuple[Tensor, Tensor]:
-        """(value [..., 1] m, gradient [..., 3]) at fractions ``t`` of the cells that start at nodes ``first``."""
+        """Return value [..., 1] m and gradient [..., 3] at fractions ``t`` of the cells that start at ``first``."""
         _, ny, nz = self.count.unbind(-1)
         i, j, k = first.unbind(-1)
         base = (i * ny + j) * nz + k
@@ -101,12 +104,12 @@ class MeshSolid(AbstractCollider):
         return value.unsqueeze(-1), torch.stack(slopes, dim=-1) / self.cell
 
     def extra_repr(self) -> str:
-        """One line of the data sheet."""
+        """Return the line of the data sheet: grid, and what colliders say."""
         return f"grid {'x'.join(map(str, self.count.tolist()))}, cell={self.cell:.3g} m, {super().extra_repr()}"
 
 
 def _bilinear(c00: Tensor, c01: Tensor, c10: Tensor, c11: Tensor, y: Tensor, z: Tensor) -> tuple[Tensor, ...]:
-    """(value, slope along y, slope along z) from the corners c[y, z] of a unit square."""
+    """Return value, slope along y and slope along z from the corners c[y, z] of a unit square."""
     low, high = c00 + z * (c01 - c00), c10 + z * (c11 - c10)
     return low + y * (high - low), high - low, (c01 - c00) + y * ((c11 - c10) - (c01 - c00))
 
@@ -132,7 +135,7 @@ def _closed(x: np.ndarray, f: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 def _signed_distances(x: np.ndarray, f: np.ndarray, at: np.ndarray) -> np.ndarray:
     try:
-        o3d = import_module("open3d")  # here, not above: it takes seconds and needs a system library
+        o3d = import_module("open3d")  # imported here: it takes seconds and needs a system library
     except ImportError as error:
         raise MissingDependency(
             "MeshSolid needs open3d", got=str(error), remedy='pip install "torchcloth[observe]"'

@@ -1,7 +1,7 @@
-"""Trajectories at knots, resolved on the integrator's substeps.
+"""Trajectories at knots, sampled on the substeps of the integrator.
 
-By operations that wake no threads of torch's (others do for a few hundred numbers: its search, indexing, square roots,
-determinants): those keep processors from the engine for milliseconds.
+Only operations that do not wake torch's threads are used, because these keep processors from the engine for
+milliseconds. Search, indexing, square roots and determinants of a few hundred numbers wake them.
 """
 
 from __future__ import annotations
@@ -12,18 +12,18 @@ import torch
 from torch import Tensor
 
 from .._utils.caching import LRUCache, bytes_of
-from .._utils.linalg import cross, dot, interpolate_hermite, find_last_knot
+from .._utils.linalg import cross, dot, find_last_knot, interpolate_hermite
 from ..errors import InvalidInput
 from ..types import Trajectory
 from .base import PrescribedMotion
 
 
 def check_trajectory(trajectory: Trajectory, name: str) -> None:
-    """Refuse a trajectory that cannot be followed.
+    """Check that a trajectory can be followed.
 
     Raises:
-        InvalidInput: shapes, time order, ``closed`` that is not bool, non-finite poses, or turns over 90 degrees
-            between knots.
+        InvalidInput: wrong shapes or time order, ``closed`` that is not bool, poses that are not finite, or turns of
+            over 90 degrees between knots.
     """
     where = f"motion[{name!r}]"
     if not isinstance(trajectory, Trajectory) or not all(isinstance(part, Tensor) for part in trajectory):
@@ -33,7 +33,7 @@ def check_trajectory(trajectory: Trajectory, name: str) -> None:
     _CHECKED_TRAJECTORIES.get_by_value(trajectory, partial(_check, trajectory, where))
 
 
-_CHECKED_TRAJECTORIES: LRUCache[None] = LRUCache(16 * 2**20, lambda _: 0)  # what was checked
+_CHECKED_TRAJECTORIES: LRUCache[None] = LRUCache(16 * 2**20, lambda _: 0)
 
 
 def _check(trajectory: Trajectory, where: str) -> None:
@@ -60,7 +60,7 @@ def _check(trajectory: Trajectory, where: str) -> None:
     rotation = pose.detach()[..., :3, :3]
     error = (rotation @ rotation.mT - torch.eye(3).to(rotation)).abs().amax()
     row = (pose.detach()[..., 3, :] - pose.new_tensor([0.0, 0.0, 0.0, 1.0])).abs().amax()
-    if float(row) > 1e-2:  # as of rotations; it has no effect
+    if float(row) > 1e-2:  # the tolerance of rotations; the row has no effect
         raise InvalidInput(
             f"{where}.pose",
             got="a last row that is not 0 0 0 1",
@@ -80,7 +80,7 @@ def _check(trajectory: Trajectory, where: str) -> None:
 
 
 def check_covers_times(trajectory: Trajectory, name: str, start: float, end: float) -> None:
-    """Refuse a trajectory that does not cover [start, end] s.
+    """Check that a trajectory covers [start, end] s.
 
     Raises:
         InvalidInput: it begins later or ends earlier.
@@ -96,18 +96,18 @@ def check_covers_times(trajectory: Trajectory, name: str, start: float, end: flo
 
 
 def interpolate_poses(trajectory: Trajectory, times: Tensor) -> Tensor:
-    """Poses [..., N, 4, 4] at ``times`` [N] s: cubic Hermite on positions and rotation columns, orthonormalised.
+    """Interpolate poses at ``times`` [N] s, [..., N, 4, 4]: cubic Hermite on positions and rotation columns.
 
-    C1, so that the held cloth sees no velocity jumps at the knots; differentiable in the knots' poses. Times are
-    counted from the first of ``times`` before they get the poses' precision: float32 has no room for substeps far
-    from 0.
+    Rotations are orthonormalised. The result is C1, so that the gripped cloth sees no velocity jumps at the knots, and
+    differentiable in the knots' poses. Times are counted from the first of ``times`` before they are rounded to the
+    poses' precision: float32 cannot resolve substeps far from 0.
     """
     pose, origin = trajectory.pose, times[:1]
-    t, times = ((some - origin).to(pose) for some in (trajectory.t.to(times), times))
+    t, times = ((absolute - origin).to(pose) for absolute in (trajectory.t.to(times), times))
     if len(t) == 1:
         return pose.expand(*pose.shape[:-3], len(times), 4, 4)
-    told = torch.cat([pose[..., :3, :2], pose[..., :3, 3:]], dim=-1)  # the third column follows from the first two
-    mixed = interpolate_hermite(t, told, _slopes(t, told), times)
+    independent = torch.cat([pose[..., :3, :2], pose[..., :3, 3:]], dim=-1)  # the third axis follows from two
+    mixed = interpolate_hermite(t, independent, _slopes(t, independent), times)
     first = mixed[..., 0]
     first = first * dot(first, first).rsqrt()
     second = mixed[..., 1]
@@ -119,10 +119,10 @@ def interpolate_poses(trajectory: Trajectory, times: Tensor) -> Tensor:
 
 
 def sample_trajectory(trajectory: Trajectory, times: Tensor) -> PrescribedMotion:
-    """Increments of motion over the substeps between consecutive ``times`` [N + 1] s, in the poses' precision.
+    """Sample a trajectory on the substeps between consecutive ``times`` [N + 1] s, in the poses' precision.
 
-    They are resolved in float64: what float32 loses of a substep is alike in all of them, and would carry a body that
-    stands still by a millimetre a second. Fits ask for the same again and again: nobody may write to one.
+    Increments are computed in float64: the rounding of float32 is the same in all substeps, and would move a body that
+    stands still by a millimetre a second. Results are cached, as fits repeat the same motion: do not write to them.
     """
     return _SAMPLED_TRAJECTORIES.get_by_value((*trajectory, times), partial(_sample_trajectory, trajectory, times))
 
@@ -131,27 +131,27 @@ _SAMPLED_TRAJECTORIES: LRUCache[PrescribedMotion] = LRUCache(64 * 2**20, lambda 
 
 
 def _sample_trajectory(trajectory: Trajectory, times: Tensor) -> PrescribedMotion:
-    given = trajectory.pose
-    pose = interpolate_poses(trajectory._replace(pose=given.double()), times)
+    knots = trajectory.pose
+    pose = interpolate_poses(trajectory._replace(pose=knots.double()), times)
     before, after = pose[..., :-1, :, :], pose[..., 1:, :, :]
     turn = after[..., :3, :3] @ before[..., :3, :3].mT
     shift = after[..., :3, 3:] - turn @ before[..., :3, 3:]
     increment = torch.cat([torch.cat([turn, shift], dim=-1), after[..., 3:, :]], dim=-2)
     t = trajectory.t.to(times)
-    knot = find_last_knot(t, times[:-1] + _slack(trajectory.t)).clamp(min=0)
+    knot = find_last_knot(t, times[:-1] + _time_tolerance(trajectory.t)).clamp(min=0)
     closed = trajectory.closed.cpu()[knot.cpu()]
-    return PrescribedMotion(increment.to(given), after.to(given), tuple(closed.tolist()))
+    return PrescribedMotion(increment.to(knots), after.to(knots), tuple(closed.tolist()))
 
 
-def _slack(t: Tensor) -> float:
-    """s, by which a knot [K] may seem to be later than it is: 0.3 is 0.30000001 in float32."""
-    own = t.detach()
-    rounding = 4 * torch.finfo(own.dtype).eps * float(own.abs().max())
-    return max(1e-9, min(rounding, 0.5 * float(own.diff().min()))) if len(own) > 1 else max(1e-9, rounding)
+def _time_tolerance(t: Tensor) -> float:
+    """Return by how much rounding may shift a knot of ``t`` [K] s: 0.3 is 0.30000001 in float32."""
+    t = t.detach()
+    rounding = 4 * torch.finfo(t.dtype).eps * float(t.abs().max())
+    return max(1e-9, min(rounding, 0.5 * float(t.diff().min()))) if len(t) > 1 else max(1e-9, rounding)
 
 
 def _slopes(t: Tensor, value: Tensor) -> Tensor:
-    """Derivative at each knot [..., K, A, B] 1/s: central differences weighted for uneven knots."""
+    """Return the derivative at each knot, [..., K, A, B] 1/s: central differences weighted for uneven knots."""
     h = (t[1:] - t[:-1])[:, None, None]
     secant = (value[..., 1:, :, :] - value[..., :-1, :, :]) / h
     if len(t) == 2:

@@ -1,4 +1,4 @@
-"""A flat obstacle."""
+"""A flat obstacle, such as a table."""
 
 from __future__ import annotations
 
@@ -43,9 +43,9 @@ class Plane(AbstractCollider):
             raise InvalidInput("friction axis", got=friction.axis.tolist(), expected="a direction in the plane")
 
     def distance(self, p: Tensor) -> tuple[Tensor, Tensor]:
-        """Height over the plane, and its normal."""
+        """Return the height over the plane, and its normal."""
         return dot(p - self.point, self.normal), self.normal.expand_as(p)
 
     def extra_repr(self) -> str:
-        """One line of the data sheet."""
+        """Return the line of the data sheet: point and normal."""
         return f"point={self.point.tolist()} m, normal={self.normal.tolist()}, {super().extra_repr()}"

@@ -1,4 +1,4 @@
-"""Round and edged solids with closed-form distances."""
+"""Spheres, boxes, capsules and cylinders, with closed-form distances."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from .friction import Coulomb, check_scalar, per_point
 
 
 class Sphere(AbstractCollider):
-    """A ball.
+    """A ball with a learnable radius.
 
     Args:
         radius: [m], learnable.
@@ -45,17 +45,17 @@ class Sphere(AbstractCollider):
         self.up: Tensor
 
     def distance(self, p: Tensor) -> tuple[Tensor, Tensor]:
-        """To the surface; the normal at the centre is the z axis."""
+        """Compute the distance to the surface; the normal at the centre is the z axis."""
         length, normal = _polar(p - self.centre, self.up)
         return length - per_point(self.radius.value), normal
 
 
 class Box(AbstractCollider):
-    """A rectangular block.
+    """A rectangular block with learnable edge lengths.
 
     Args:
         size: [3] m, edge lengths along its own axes, learnable.
-        pose: [4, 4], of the block's centre and axes in the world, or in the body when it moves. None: at the origin.
+        pose: [4, 4], of the block's centre and axes in the world, or in the body when it moves. None: the origin.
         friction: Coulomb coefficient >= 0, or a law.
         options: as for every collider (``AbstractCollider``).
 
@@ -74,14 +74,14 @@ class Box(AbstractCollider):
         self.size = PhysicalParameter(parse_vector("box size", size), "m", name="box size")
 
     def distance(self, p: Tensor) -> tuple[Tensor, Tensor]:
-        """To the nearest face, edge or corner."""
+        """Compute the distance to the nearest face, edge or corner."""
         half = self.size.value.unsqueeze(-2) / 2
-        distance, part = _beyond(p.abs() - half)
+        distance, part = _block_distance(p.abs() - half)
         return distance, torch.where(p < 0, -part, part)
 
 
 class _Axial(AbstractCollider):
-    """What has an axis and a radius."""
+    """A solid with an axis and a radius."""
 
     def __init__(
         self,
@@ -99,11 +99,11 @@ class _Axial(AbstractCollider):
         check_scalar("radius", self.radius)
         self.register_buffer("start", a, persistent=False)
         self.register_buffer("end", b, persistent=False)
-        aside = cross(b - a, torch.eye(3).to(a)[(b - a).abs().argmin()])
-        self.register_buffer("aside", aside / aside.norm(), persistent=False)
+        perpendicular = cross(b - a, torch.eye(3).to(a)[(b - a).abs().argmin()])
+        self.register_buffer("perpendicular", perpendicular / perpendicular.norm(), persistent=False)
         self.start: Tensor
         self.end: Tensor
-        self.aside: Tensor  # [3], a unit vector perpendicular to the axis
+        self.perpendicular: Tensor  # [3], a unit vector perpendicular to the axis
 
 
 class Capsule(_Axial):
@@ -121,10 +121,10 @@ class Capsule(_Axial):
     """
 
     def distance(self, p: Tensor) -> tuple[Tensor, Tensor]:
-        """To the surface; on the segment the normal is some perpendicular."""
+        """Compute the distance to the surface; on the segment the normal is some perpendicular."""
         axis = self.end - self.start
         along = (dot(p - self.start, axis) / dot(axis, axis)).clamp(0, 1)
-        length, normal = _polar(p - self.start - along * axis, self.aside)
+        length, normal = _polar(p - self.start - along * axis, self.perpendicular)
         return length - per_point(self.radius.value), normal
 
 
@@ -143,28 +143,30 @@ class Cylinder(_Axial):
     """
 
     def distance(self, p: Tensor) -> tuple[Tensor, Tensor]:
-        """To the barrel, an end, or the rim; on the axis the barrel's normal is some perpendicular."""
+        """Compute the distance to barrel, end or rim; on the axis the barrel's normal is some perpendicular."""
         length = (self.end - self.start).norm()
         axis = (self.end - self.start) / length
         q = p - (self.start + self.end) / 2
         height = dot(q, axis)
-        radial, outwards = _polar(q - height * axis, self.aside)
+        radial, outwards = _polar(q - height * axis, self.perpendicular)
         gaps = torch.broadcast_tensors(radial - per_point(self.radius.value), height.abs() - length / 2)
-        distance, part = _beyond(torch.cat(gaps, dim=-1))
+        distance, part = _block_distance(torch.cat(gaps, dim=-1))
         side, top = part.split(1, dim=-1)
         return distance, side * outwards + torch.where(height < 0, -top, top) * axis
 
 
 def _polar(q: Tensor, fallback: Tensor) -> tuple[Tensor, Tensor]:
-    """(length [..., 1], unit vector [..., 3]); the fallback where there is no direction."""
+    """Return length [..., 1] and unit vector [..., 3]; the fallback where there is no direction."""
     length = safe_norm(q)
     zero = length == 0
     return length, torch.where(zero, fallback, q / torch.where(zero, 1.0, length))
 
 
-def _beyond(gap: Tensor) -> tuple[Tensor, Tensor]:
-    """Signed distance [..., 1] to a block and the normal's components [..., K] >= 0, from the signed distances to its
-    pairs of parallel sides [..., K]."""
+def _block_distance(gap: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the signed distance [..., 1] to a block, and the absolute components [..., K] of its normal.
+
+    ``gap`` holds the signed distances [..., K] to the block's pairs of parallel sides.
+    """
     nearest, side = gap.max(-1, keepdim=True)
     outside, part = _polar(gap.clamp(min=0), torch.zeros_like(gap).scatter(-1, side, 1.0))
     return torch.where(outside > 0, outside, nearest), part

@@ -19,9 +19,7 @@ from .model import Model
 MATERIAL_MEMORY_KEY = "material"  # the plastic set, among the internal variables
 
 
-def update_memory(
-    model: Model, state: ClothState, s: Surface, dt: float, compensation: Tensor | None = None
-) -> Memory:
+def update_memory(model: Model, state: ClothState, s: Surface, dt: float, compensation: Tensor | None = None) -> Memory:
     """Advance plastic set, internal friction and creases to the present deformation, ``dt`` [s] after the last time."""
     memory = dict(state.memory)
     if MATERIAL_MEMORY_KEY in memory:

@@ -55,9 +55,7 @@ def vertex_forces(
     first = -(second + third)
     on_vertices = None
     for name, (effect, c) in model.effects.items():
-        inputs = EffectInputs(
-            state.x, state.v, s, model.mass, memory.get(f"effects.{name}"), compensation=compensation
-        )
+        inputs = EffectInputs(state.x, state.v, s, model.mass, memory.get(f"effects.{name}"), compensation=compensation)
         force = effect_force(name, effect, c, inputs)
         if force is None:
             continue

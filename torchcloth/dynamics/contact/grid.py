@@ -1,4 +1,4 @@
-"""The discretisation of contact: grid spacing and contact points, independent of the mesh."""
+"""Discretisation of the contact between layers: grid spacing and contact points."""
 
 from __future__ import annotations
 
@@ -15,39 +15,53 @@ from ...errors import InvalidInput
 from ...meshes import Mesh
 from .neighbours import find_non_adjacent_triangles, find_overlapping_triangles
 
-SEARCH_SKIN_SPACINGS = 2.0  # grid spacings that layers may approach each other before the search for near ones is repeated
-INTERACTION_RANGE_SPACINGS = 4.0  # grid spacings: the splines of points farther apart have no node of any weight in common
-COMPRESSION_ONSET_SPACINGS = 2.26  # grid spacings at which approaching layers begin to compress each other's directors
-APPROACH_PER_COMPRESSION_SPACINGS = 3.5  # and by how many they must approach for each unit of 1 - R33 (both measured, tests/physics/test_contact)
-REST_GAP_SPACINGS = 1.4  # grid spacings between layers at rest, with the default play
-MAX_POINT_DISTANCE_SPACINGS = 1.4  # grid spacings between corners of sub-triangles: no hole between the points exceeds 0.7 spacings
-WRAP_EXTENT_FACTOR = 1.6  # times the longest way along the cloth: the extent at which the grid wraps, so that layers never alias
-MAX_POINTS_PER_EDGE = 100  # points along a triangle's edge: 10 000 in it
-WARN_POINTS_PER_TRIANGLE = 64  # points in a triangle, of which a cloth says so; usual are 1 to 4
-WARN_UNSEEN_LAYER_FRACTION = 0.5  # share of the triangles of layers that do not see the other layer, from which a cloth says so
-FOLD_PATH_RATIO = 1.7  # layers are folded on each other where the way along the cloth is that much longer than through space
+# Lengths in grid spacings. COMPRESSION_ONSET and APPROACH_PER_COMPRESSION are measured (tests/physics/test_contact.py).
+SEARCH_SKIN_SPACINGS = 2.0  # by how much layers may approach each other before candidates are searched again
+INTERACTION_RANGE_SPACINGS = 4.0  # splines of points farther apart share no node of any weight
+COMPRESSION_ONSET_SPACINGS = 2.26  # distance at which approaching layers begin to compress each other's directors
+APPROACH_PER_COMPRESSION_SPACINGS = 3.5  # approach from there on for each unit of compression 1 - R33
+REST_GAP_SPACINGS = 1.4  # between layers at rest, with the default free compression
+MAX_POINT_DISTANCE_SPACINGS = 1.4  # between corners of sub-triangles: no hole between points exceeds 0.7 spacings
+# The grid wraps at this multiple of the longest path along the cloth, so that layers never meet their own images.
+WRAP_EXTENT_FACTOR = 1.6
+MAX_POINTS_PER_EDGE = 100  # that is 10 000 points in a triangle
+WARN_POINTS_PER_TRIANGLE = 64  # usual are 1 to 4
+WARN_UNSEEN_LAYER_FRACTION = 0.5  # of the triangles in layers, those that do not see the other layer
+FOLD_PATH_RATIO = 1.7  # layers are folded on each other where the path along the cloth is so much longer than in space
 
 
 class Grid(NamedTuple):
-    """What contact through the grid needs."""
+    """Contact points and grid of one cloth.
 
-    points: Tensor  # [S, 3] barycentric coordinates of each triangle's contact points
-    spacing: float  # m
-    nodes: int  # per axis before the grid wraps
-    skin: float  # m, see SKIN
-    reach: float  # m, centroids of triangles that may touch before the search is repeated
-    free_compression: float  # compression 1 - R33 of the director before layers press
-    damping: float  # s
-    non_adjacent: Tensor | None  # [E, E] bool, not neighbours along the cloth; None: every triangle always takes part
+    Attributes:
+        points: [S, 3], barycentric coordinates of the contact points of each triangle.
+        spacing: grid spacing [m].
+        nodes: number of nodes per axis before the grid wraps.
+        skin: SEARCH_SKIN_SPACINGS in metres.
+        reach: distance [m] of the centroids of triangles that may touch before candidates are searched again.
+        free_compression: compression 1 - R33 of the director before layers press, dimensionless.
+        damping: of the collision [s].
+        non_adjacent: [E, E] bool, pairs of triangles that are not neighbours along the cloth; None: every triangle
+            always takes part.
+    """
+
+    points: Tensor
+    spacing: float
+    nodes: int
+    skin: float
+    reach: float
+    free_compression: float
+    damping: float
+    non_adjacent: Tensor | None
 
     @property
     def max_extent(self) -> float:
-        """Extent [m] of a cloth for which there is room before the grid wraps."""
+        """Largest extent [m] of a cloth that fits into the grid before it wraps."""
         return (self.nodes - 4) * self.spacing
 
     @property
     def summary(self) -> str:
-        """For the data sheet of a cloth."""
+        """Description for the data sheet of a cloth: gap between layers, and points per triangle."""
         gap, unseen = 1e3 * REST_GAP_SPACINGS * self.spacing, 1e3 * FOLD_PATH_RATIO * self.reach
         return (
             f"layers rest {gap:.3g} mm apart, unseen within {unseen:.3g} mm along the cloth; "
@@ -55,50 +69,51 @@ class Grid(NamedTuple):
         )
 
     def contact_warnings(self, mesh: Mesh) -> Iterator[str]:
-        """What a user must know: of what contact costs, and of layers that lie over each other and do not meet."""
+        """Yield warnings about the cost of contact, and about layers that lie over each other but do not interact."""
         if len(self.points) >= WARN_POINTS_PER_TRIANGLE:
             yield (
                 f"contact: edges of some {1e3 * mesh.coarse_edge:.3g} mm take {len(self.points)} points in each "
-                f"triangle near another layer, and each costs as much as a triangle ({self.summary}): give the mesh more "
-                "triangles, or contact=Contact.with_gap(...) a larger gap"
+                f"triangle near another layer, and each costs as much as a triangle ({self.summary}): give the mesh "
+                "more triangles, or contact=Contact.with_gap(...) a larger gap"
             )
         pairs = find_overlapping_triangles(mesh, 2 * REST_GAP_SPACINGS * self.spacing)
         if self.non_adjacent is None or not len(pairs):
             return
-        layered, seen = np.unique(pairs[:, 0]), np.unique(pairs[self.non_adjacent.cpu().numpy()[pairs[:, 0], pairs[:, 1]], 0])
-        share = 1 - len(seen) / len(layered)
-        if share > WARN_UNSEEN_LAYER_FRACTION:
+        is_seen = self.non_adjacent.cpu().numpy()[pairs[:, 0], pairs[:, 1]]
+        unseen_fraction = 1 - len(np.unique(pairs[is_seen, 0])) / len(np.unique(pairs[:, 0]))
+        if unseen_fraction > WARN_UNSEEN_LAYER_FRACTION:
             yield (
-                f"contact: {100 * share:.0f} % of the triangles that lie over another layer do not see it and pass "
-                f"through ({self.summary}): give contact=Contact.with_gap(...) a smaller gap, or the mesh more triangles"
+                f"contact: {100 * unseen_fraction:.0f} % of the triangles that lie over another layer do not see it and "
+                f"pass through ({self.summary}): give contact=Contact.with_gap(...) a smaller gap, or the mesh more "
+                "triangles"
             )
 
 
 @dataclass(frozen=True)
 class Contact:
-    """How finely layers of cloth see each other.
+    """Discretisation of the contact between layers of cloth, independent of the mesh.
 
-    Layers come to rest ``GAP`` = 1.4 spacings apart (1.3 to 1.5, for pressures from a fabric's weight to a hundred
-    times that); layers that start nearer stay nearer. Only triangles near another layer take part, and cost anything.
-    Triangles are neighbours, and do not see each other, up to a way of about 10 spacings plus 3 edges along the cloth:
-    ``print(cloth)`` says how far. A coarse cloth needs a finer mesh before its folds can touch.
+    Layers come to rest 1.4 grid spacings apart (1.3 to 1.5, for pressures from a fabric's weight to a hundred times
+    that); layers that start nearer stay nearer. Only triangles near another layer take part and cost time. Triangles
+    within about 10 spacings plus 3 edges along the cloth count as neighbours and do not interact: ``print(cloth)`` says
+    how far. A coarse cloth needs a finer mesh before its folds can touch.
 
-    Cost: points per triangle grow with (edge / spacing)^2, so a small gap wants small triangles, and even ones: all get
-    as many as the longest edges ask for. The stable step falls with spacing sqrt(areal density / (k h)), so a small gap
-    wants k h of 30 to 100 N/m, far below published presets.
+    Cost: points per triangle grow with (edge / spacing)^2, so a small gap needs small triangles of even size, because
+    all get as many points as the longest edges need. The stable step falls with spacing sqrt(areal density / (k h)), so
+    a small gap needs k h of 30 to 100 N/m, far below published presets.
 
     Args:
         spacing: grid spacing [m]; None: the mesh's mean edge. See ``with_gap``.
         subdivisions: contact points per triangle edge (points per triangle = its square); None: as many as the
-            spacing asks for; sparser points would let layers pass through each other.
-        damping: of the collision [s] (Hunt and Crossley 1975): the pressure of closing layers grows, that of parting
-            layers falls by damping times the rate of the director's compression. 0: layers bounce like rubber.
-        play: compression 1 - R33 of the director at which layers begin to press. The splines of layers 2.3 spacings
-            apart still overlap: with play 0, as published, they rest there.
-        everywhere: let all triangles take part always, as material point methods do; for comparison.
+            spacing needs. Sparser points would let layers pass through each other.
+        damping: of the collision [s] (Hunt and Crossley 1975). The pressure grows as layers close and falls as they
+            part, by damping times the rate of the director's compression. 0: layers bounce like rubber.
+        free_compression: compression 1 - R33 of the director at which layers begin to press. The splines of layers 2.3
+            spacings apart still overlap: with 0, as published, layers rest there.
+        everywhere: all triangles always take part, as in material point methods; for comparison.
 
     Raises:
-        InvalidInput: negative damping, or a play outside [0, 0.5].
+        InvalidInput: negative damping, or a free compression outside [0, 0.5].
     """
 
     spacing: float | None = None
@@ -115,20 +130,26 @@ class Contact:
 
     @classmethod
     def with_gap(cls, gap: float, **changes) -> Contact:
-        """Contact whose layers rest ``gap`` [m] apart, from centre to centre; ``changes`` as for the class."""
+        """Build contact whose layers rest ``gap`` [m] apart, from centre to centre; ``changes`` as for the class.
+
+        Raises:
+            InvalidInput: a gap that is not positive.
+        """
         if not 0 < gap < float("inf"):
             raise InvalidInput("contact gap", got=f"{gap:g} m", expected="a length > 0")
         return cls(spacing=gap / REST_GAP_SPACINGS, **changes)
 
     def build_grid(self, mesh: Mesh) -> Grid:
-        """Everything that mesh and contact fix, in the default precision.
+        """Build the contact grid of a mesh, in the default precision.
 
         Raises:
             InvalidInput: a spacing that is not positive, or longer than the cloth, or points too sparse or many for it.
         """
         spacing, points = self.resolve(mesh)
         corner = mesh.rest - mesh.rest.mean(1, keepdims=True)
-        reach = float((INTERACTION_RANGE_SPACINGS + SEARCH_SKIN_SPACINGS) * spacing + 2 * np.linalg.norm(corner, axis=-1).max())
+        reach = float(
+            (INTERACTION_RANGE_SPACINGS + SEARCH_SKIN_SPACINGS) * spacing + 2 * np.linalg.norm(corner, axis=-1).max()
+        )
         longest = max(float(np.linalg.norm(np.ptp(mesh.vertices, axis=0))), mesh.extent)
         if spacing > longest:
             expected = f"at most the length of the cloth, {longest:.3g} m"
@@ -141,11 +162,13 @@ class Contact:
             reach=reach,
             free_compression=self.free_compression,
             damping=self.damping,
-            non_adjacent=None if self.everywhere else torch.as_tensor(find_non_adjacent_triangles(mesh, FOLD_PATH_RATIO * reach)),
+            non_adjacent=None
+            if self.everywhere
+            else torch.as_tensor(find_non_adjacent_triangles(mesh, FOLD_PATH_RATIO * reach)),
         )
 
     def resolve(self, mesh: Mesh) -> tuple[float, np.ndarray]:
-        """(spacing [m], barycentric coordinates of the points of one triangle [S, 3]).
+        """Return the spacing [m], and the barycentric coordinates [S, 3] of the points of one triangle.
 
         Raises:
             InvalidInput: a spacing that is not positive, or points too sparse or many for it.
@@ -154,14 +177,15 @@ class Contact:
         spacing = mesh.mean_edge if self.spacing is None else float(self.spacing)
         if not spacing > 0:
             raise InvalidInput("contact spacing", got=f"{spacing:g} m", expected="a length > 0")
+        per_edge = edge / (MAX_POINT_DISTANCE_SPACINGS * spacing)
         if not spacing * MAX_POINT_DISTANCE_SPACINGS * MAX_POINTS_PER_EDGE >= edge:
             raise InvalidInput(
                 "contact spacing",
-                got=f"{spacing:g} m, for which a triangle needs {edge / (MAX_POINT_DISTANCE_SPACINGS * spacing):.2g} points along an edge",
+                got=f"{spacing:g} m, for which a triangle needs {per_edge:.2g} points along an edge",
                 expected=f"{edge / (MAX_POINT_DISTANCE_SPACINGS * MAX_POINTS_PER_EDGE):.2g} m or more on this mesh",
                 remedy="refine the mesh, or give the grid's spacing in metres",
             )
-        needed = max(1, int(np.ceil(edge / (MAX_POINT_DISTANCE_SPACINGS * spacing))))
+        needed = max(1, int(np.ceil(per_edge)))
         s = needed if self.subdivisions is None else self.subdivisions
         if not isinstance(s, Real) or s % 1 != 0:
             raise InvalidInput("contact subdivisions", got=self.subdivisions, expected="a whole number")
@@ -179,7 +203,7 @@ class Contact:
 
 
 def _centroids(s: int) -> np.ndarray:
-    """Barycentric centroids [s^2, 3] of the s^2 equal sub-triangles of a triangle."""
+    """Return barycentric centroids [s^2, 3] of the s^2 equal sub-triangles of a triangle."""
     rows = []
     for i in range(s):
         for j in range(s - i):

@@ -1,6 +1,9 @@
 """Contact between layers of cloth: which triangles are near another layer, and what the grid does to them.
 
-Away from other layers a director would only follow its own sheet, so it simply is the normal there, and costs nothing.
+Every contact point carries a director d3, which is compressed and sheared where layers press on each other. Away from
+other layers a director would only follow its own sheet, so it is set to the normal there and costs nothing. A substep
+calls ``find_contact_candidates``, ``compute_director_forces``, ``add_director_stress``, ``contact_velocity_change`` and
+``advance_directors``, in this order.
 """
 
 from __future__ import annotations
@@ -10,54 +13,75 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from ..._utils.linalg import EXACT_CDIST_MODE, cross, dot
+from ..._utils.linalg import EXACT_CDIST_MODE, cross, dot, matvec
 from ...types import ClothState, Surface
 from ..kinematics import centroids, corners, surface
 from ..model import Model
-from . import (
+from .grid import (
     APPROACH_PER_COMPRESSION_SPACINGS,
     COMPRESSION_ONSET_SPACINGS,
     INTERACTION_RANGE_SPACINGS,
     SEARCH_SKIN_SPACINGS,
     Grid,
-    Stencil,
-    place_on_grid,
-    transfer_director_forces,
-    velocity_gradient,
 )
+from .transfer import Stencil, place_on_grid, transfer_director_forces, velocity_gradient
 
-# Substeps between checkpoints of a long interval: memory ~ frames + CHUNK, one extra forward pass. Near layers are
-# searched again at each, as substeps that are computed anew start there.
+# Of a long interval: memory grows as frames + SUBSTEPS_PER_CHECKPOINT, for one extra forward pass. Candidates are
+# searched again at each checkpoint, because substeps that are recomputed start there.
 SUBSTEPS_PER_CHECKPOINT = 48
 
 
 class ContactCandidates(NamedTuple):
-    """Triangles near another layer, over all scenes of the batch, while no vertex has moved far from ``x``."""
+    """Active triangles: those near another layer, over all scenes of the batch, while no vertex is far from ``x``.
 
-    active: Tensor  # [A] int64, scene E + triangle
-    scene: Tensor  # [A] int64
-    vertices: Tensor  # [3, A] int64, scene V + vertex
-    slots: Tensor  # int32, scratch of the grid: one per node
-    x: Tensor  # [..., V, 3] m
+    Attributes:
+        active: [A] int64, scene E + triangle.
+        scene: [A] int64.
+        vertices: [3, A] int64, scene V + vertex.
+        slots: int32, scratch of the grid, one per node.
+        x: [..., V, 3] m, positions at the search.
+    """
+
+    active: Tensor
+    scene: Tensor
+    vertices: Tensor
+    slots: Tensor
+    x: Tensor
 
 
 class DirectorForces(NamedTuple):
-    """What the directors of the active triangles do."""
+    """Forces of the directors of the A active triangles, with S contact points each.
 
-    column1: Tensor  # [A, 3] N/m, reaction in the surface's columns; without it angular momentum breaks
+    Attributes:
+        column1: [A, 3] N/m, reaction in the warp column of the surface; without it angular momentum is not conserved.
+        column2: [A, 3] N/m, reaction in the weft column.
+        pull: [A S, 3] N m, area-weighted derivative with respect to d3, which acts through the grid.
+        d3: [A S, 3] -, directors.
+        mass: [A S, 1] kg, masses of the points.
+        nodes: the points' nodes.
+    """
+
+    column1: Tensor
     column2: Tensor
-    pull: Tensor  # [A S, 3] N m, area-weighted derivative with respect to d3, acts through the grid
-    d3: Tensor  # [A S, 3]
-    mass: Tensor  # [A S, 1] kg, of the points
+    pull: Tensor
+    d3: Tensor
+    mass: Tensor
     nodes: Stencil
 
 
 @torch.no_grad()
-def find_contact_candidates(model: Model, grid: Grid, x: Tensor, previous: ContactCandidates | None = None) -> ContactCandidates:
-    """Triangles whose points may meet those of another layer before a vertex has moved by half the grid's skin
-    along any axis.
+def find_contact_candidates(
+    model: Model, grid: Grid, x: Tensor, previous: ContactCandidates | None = None
+) -> ContactCandidates:
+    """Find the triangles whose points may meet another layer before a vertex moves by half the grid's skin.
 
     Another layer is what is near in space but far along the cloth.
+
+    Args:
+        model: the model.
+        grid: the contact grid.
+        x: [..., V, 3] m.
+        previous: result of an earlier search, returned if no vertex has moved that far along any axis since.
     """
     if previous is not None and float((x - previous.x).abs().max()) < grid.skin / 2:
         return previous
@@ -66,140 +90,179 @@ def find_contact_candidates(model: Model, grid: Grid, x: Tensor, previous: Conta
     if grid.non_adjacent is None:
         near = torch.ones(centre.shape[:2], dtype=torch.bool, device=x.device)
     else:
-        near = torch.stack(
-            [((torch.cdist(p, p, compute_mode=EXACT_CDIST_MODE) < grid.reach) & grid.non_adjacent).any(-1) for p in centre]
-        )
+        within_reach = (torch.cdist(p, p, compute_mode=EXACT_CDIST_MODE) < grid.reach for p in centre)
+        near = torch.stack([(pairs & grid.non_adjacent).any(-1) for pairs in within_reach])
     scene, triangle = near.nonzero(as_tuple=True)
     scenes, triangles = near.shape
-    own = model.geometry.corners.view(3, -1).index_select(1, triangle) + scene * x.shape[-2]
+    vertices = model.geometry.corners.view(3, -1).index_select(1, triangle) + scene * x.shape[-2]
     slots = torch.empty(scenes * grid.nodes**3 if len(scene) else 0, dtype=torch.int32, device=x.device)
-    return ContactCandidates(scene * triangles + triangle, scene, own, slots, x)
+    return ContactCandidates(scene * triangles + triangle, scene, vertices, slots, x)
 
 
 def initial_directors(model: Model, grid: Grid, x: Tensor) -> Tensor:
-    """Directors [..., P, 3] of a cloth whose layers have come to where they are without being pressed.
+    """Return directors [..., P, 3] of a cloth whose layers have come to their places without being pressed.
 
-    Layers that start within each other's splines would else have to give way by the whole play from there.
+    Layers that start within each other's splines would otherwise give way by the whole free compression from there.
     """
     d3 = n = surface(model.geometry, x, x).n
     if grid.non_adjacent is not None and grid.free_compression > 0:
-        d3 = (1 - _unpressed(grid, grid.non_adjacent, centroids(model.geometry, x), n)) * n
+        d3 = (1 - _unpressed_compression(grid, grid.non_adjacent, centroids(model.geometry, x), n)) * n
     return d3.repeat_interleave(grid.points.shape[0], dim=-2)
 
 
-def _unpressed(grid: Grid, apart: Tensor, centre: Tensor, n: Tensor) -> Tensor:
-    """Compression [..., E, 1] at which layers that are as near as the triangles with these centres do not yet press."""
+def _unpressed_compression(grid: Grid, non_adjacent: Tensor, centre: Tensor, n: Tensor) -> Tensor:
+    """Return the compression [..., E, 1] at which layers as near as these triangles do not yet press."""
     side = (grid.reach - (INTERACTION_RANGE_SPACINGS + SEARCH_SKIN_SPACINGS) * grid.spacing) / 2
-    farthest = COMPRESSION_ONSET_SPACINGS * grid.spacing + side  # pairs beyond do not press, whatever their direction
-    found = []
+    pressing_range = COMPRESSION_ONSET_SPACINGS * grid.spacing + side  # for pairs in any direction
+    compressions = []
     for points, normals in zip(centre.reshape(-1, *n.shape[-2:]), n.reshape(-1, *n.shape[-2:]), strict=True):
-        fixed = points.detach()  # which pairs; how near they are has derivatives
-        over, under = ((torch.cdist(fixed, fixed, compute_mode=EXACT_CDIST_MODE) <= farthest) & apart).nonzero(as_tuple=True)
+        fixed = points.detach()  # which pairs are near has no derivative; how near they are has
+        within_range = torch.cdist(fixed, fixed, compute_mode=EXACT_CDIST_MODE) <= pressing_range
+        over, under = (within_range & non_adjacent).nonzero(as_tuple=True)
         between = points[over] - points[under]
         height = dot(between, normals[under]).abs()
-        beside = (dot(between, between) - height**2).clamp(min=0).sqrt() > side
-        close = ((COMPRESSION_ONSET_SPACINGS - height / grid.spacing) / APPROACH_PER_COMPRESSION_SPACINGS).masked_fill(beside, 0.0).clamp(0, grid.free_compression)
-        found.append(points.new_zeros(len(points), 1).scatter_reduce(0, over.unsqueeze(-1), close, "amax"))
-    return torch.stack(found).view(*n.shape[:-1], 1)
+        is_lateral = (dot(between, between) - height**2).clamp(min=0).sqrt() > side
+        compression = (COMPRESSION_ONSET_SPACINGS - height / grid.spacing) / APPROACH_PER_COMPRESSION_SPACINGS
+        compression = compression.masked_fill(is_lateral, 0.0).clamp(0, grid.free_compression)
+        largest = points.new_zeros(len(points), 1).scatter_reduce(0, over.unsqueeze(-1), compression, "amax")
+        compressions.append(largest)
+    return torch.stack(compressions).view(*n.shape[:-1], 1)
 
 
-def compute_director_forces(model: Model, grid: Grid, layers: ContactCandidates, state: ClothState, s: Surface, dt: float) -> DirectorForces:
-    """Split the director's stress into what acts on the surface columns (through n) and on d3 itself.
+def compute_director_forces(
+    model: Model, grid: Grid, candidates: ContactCandidates, state: ClothState, s: Surface, dt: float
+) -> DirectorForces:
+    """Split the directors' stress into what acts on the surface columns (through n) and on d3 itself.
 
-    The collision's damping knows the rate of closing from the substep before; divided as if it were implicit, it stays
+    The collision's damping uses the rate of closing from the substep before. Divided as if it were implicit, it is
     stable however hard layers are pressed.
     """
     count = grid.points.shape[0]
-    n, J, f1, f2, area = (_pick(layers, field, s.n) for field in (s.n, s.J, s.f1, s.f2, s.area))
-    d3 = state.d3.reshape(-1, count, 3).index_select(0, layers.active)
+    n, J, f1, f2, area = (_select_active(candidates, field, s.n) for field in (s.n, s.J, s.f1, s.f2, s.area))
+    d3 = state.d3.reshape(-1, count, 3).index_select(0, candidates.active)
     normal = n.unsqueeze(-2)
     by_normal, by_director = model.material.director_stress(
-        coefficients_per_point(model, layers, s), normal, d3 + grid.free_compression * normal
+        coefficients_per_point(model, candidates, s), normal, d3 + grid.free_compression * normal
     )
     by_normal = by_normal + grid.free_compression * by_director
-    closing = state.memory["contact"].reshape(-1, count, 1).index_select(0, layers.active)
-    press = dot(by_director, normal).clamp(max=0)
-    density = _pick(layers, model.areal_density, s.n).unsqueeze(-2)
-    slowed = 1 - (2 * dt * grid.damping / (APPROACH_PER_COMPRESSION_SPACINGS * grid.spacing) ** 2) * press / density
-    loss = press * (grid.damping * closing / slowed).clamp(min=-1)
-    by_normal, by_director = by_normal + loss * d3, by_director + loss * normal
+
+    closing = state.memory["contact"].reshape(-1, count, 1).index_select(0, candidates.active)
+    pressure = dot(by_director, normal).clamp(max=0)
+    density = _select_active(candidates, model.areal_density, s.n).unsqueeze(-2)
+    implicit = (
+        1 - (2 * dt * grid.damping / (APPROACH_PER_COMPRESSION_SPACINGS * grid.spacing) ** 2) * pressure / density
+    )
+    damping = pressure * (grid.damping * closing / implicit).clamp(min=-1)
+    by_normal, by_director = by_normal + damping * d3, by_director + damping * normal
+
     turn = by_normal.sum(-2) / count
     turn = (turn - dot(turn, n) * n) / J  # n has unit length: only its tangential change is real
     pull = (area.unsqueeze(-2) / count) * by_director
-    mass = _each(_pick(layers, model.areal_density * s.area, s.n) / count, count)
-    nodes = place_on_grid(_points(grid, layers, state.x), mass, _each(layers.scene, count), grid, layers.slots)
+    mass = _repeat_for_points(_select_active(candidates, model.areal_density * s.area, s.n) / count, count)
+    position = _at_points(grid, candidates, state.x)
+    nodes = place_on_grid(position, mass, _repeat_for_points(candidates.scene, count), grid, candidates.slots)
     return DirectorForces(cross(f2, turn), cross(turn, f1), pull.flatten(0, 1), d3.flatten(0, 1), mass, nodes)
 
 
-def add_director_stress(layers: ContactCandidates, columns: tuple[Tensor, Tensor], p: DirectorForces) -> tuple[Tensor, Tensor]:
-    """Membrane stress columns [..., E, 3] with the directors' reaction."""
+def add_director_stress(
+    candidates: ContactCandidates, stress: tuple[Tensor, Tensor], directors: DirectorForces
+) -> tuple[Tensor, Tensor]:
+    """Add the directors' reaction to the columns [..., E, 3] N/m of the membrane stress."""
     first, second = (
-        column.reshape(-1, 3).index_add(0, layers.active, extra).view(column.shape)
-        for column, extra in zip(columns, (p.column1, p.column2), strict=True)
+        column.reshape(-1, 3).index_add(0, candidates.active, reaction).view(column.shape)
+        for column, reaction in zip(stress, (directors.column1, directors.column2), strict=True)
     )
     return first, second
 
 
-def contact_velocity_change(model: Model, grid: Grid, layers: ContactCandidates, p: DirectorForces, s: Surface, like: Tensor, dt: float) -> Tensor:
-    """Change of the vertices' velocities [..., V, 3] m/s by contact.
+def contact_velocity_change(
+    model: Model,
+    grid: Grid,
+    candidates: ContactCandidates,
+    directors: DirectorForces,
+    s: Surface,
+    like: Tensor,
+    dt: float,
+) -> Tensor:
+    """Compute by how much contact changes the vertices' velocities, [..., V, 3] m/s (the shape of ``like``).
 
-    The exact transpose of how vertices carry velocity to the nodes, with the affine part: momentum and its moment are
-    kept to rounding, and contact is as symmetric as elasticity.
+    This is the exact transpose of how vertices carry velocity to the nodes, with the affine part. So linear and angular
+    momentum are conserved to rounding, and contact is as symmetric as elasticity.
     """
     count = grid.points.shape[0]
-    change, moment = transfer_director_forces(p.nodes, p.pull, p.d3, grid.spacing, dt)
-    momentum = (p.mass * change).unflatten(0, (-1, count))
+    change, moment = transfer_director_forces(directors.nodes, directors.pull, directors.d3, grid.spacing, dt)
+    momentum = (directors.mass * change).unflatten(0, (-1, count))
     shares = torch.stack([(grid.points[:, corner, None] * momentum).sum(-2) for corner in range(3)])
-    shares = shares + _affine_shares(model, layers, s, (p.mass.unsqueeze(-1) * moment).unflatten(0, (-1, count)).sum(1))
-    total = torch.zeros_like(like).reshape(-1, 3).index_add(0, layers.vertices.flatten(), shares.flatten(0, 1))
+    moments = (directors.mass.unsqueeze(-1) * moment).unflatten(0, (-1, count)).sum(1)
+    shares = shares + _affine_shares(model, candidates, s, moments)
+    total = torch.zeros_like(like).reshape(-1, 3).index_add(0, candidates.vertices.flatten(), shares.flatten(0, 1))
     return total.view(like.shape) / model.mass
 
 
-def _affine_shares(model: Model, layers: ContactCandidates, s: Surface, moment: Tensor) -> Tensor:
-    """Impulses [3, A, 3] N s at the corners: the transpose of ``_mesh_gradient`` applied to ``moment`` [A, 3, 3]."""
-    n, J, dual1, dual2 = (_pick(layers, field, s.n) for field in (s.n, s.J, s.cofactor1, s.cofactor2))
+def _affine_shares(model: Model, candidates: ContactCandidates, s: Surface, moment: Tensor) -> Tensor:
+    """Return corner impulses [3, A, 3] N s: the transpose of ``_mesh_velocity_gradient``, of a moment [A, 3, 3]."""
+    n, J, dual1, dual2 = (_select_active(candidates, field, s.n) for field in (s.n, s.J, s.cofactor1, s.cofactor2))
     dual1, dual2 = dual1 / J, dual2 / J
-    normal = _times(moment, n)
-    first = _times(moment, dual1) - dot(normal, dual1) * n
-    second = _times(moment, dual2) - dot(normal, dual2) * n
-    warp, weft = ([_pick(layers, part, s.n) for part in pair] for pair in (model.geometry.warp, model.geometry.weft))
+    normal = matvec(moment, n)
+    first = matvec(moment, dual1) - dot(normal, dual1) * n
+    second = matvec(moment, dual2) - dot(normal, dual2) * n
+    g = model.geometry
+    warp, weft = ([_select_active(candidates, part, s.n) for part in pair] for pair in (g.warp, g.weft))
     b, c = (warp[k] * first + weft[k] * second for k in range(2))
     return torch.stack([-(b + c), b, c])
 
 
-def _times(matrix: Tensor, vector: Tensor) -> Tensor:
-    return (matrix @ vector.unsqueeze(-1)).squeeze(-1)
-
-
 def advance_directors(
-    model: Model, grid: Grid, layers: ContactCandidates, p: DirectorForces | None, s: Surface, v: Tensor, now: Surface, dt: float
+    model: Model,
+    grid: Grid,
+    candidates: ContactCandidates,
+    directors: DirectorForces | None,
+    before: Surface,
+    v: Tensor,
+    after: Surface,
+    dt: float,
 ) -> tuple[Tensor, Tensor]:
-    """Directors [..., P, 3] carried by the velocities v that the cloth got and mapped back, and how fast they close.
+    """Carry the directors along with the velocities of the cloth, and map them back to the friction cone.
 
-    Far from other layers they are the normals. Closing is -dR33/dt [..., P, 1] 1/s. ``s`` is the surface that the
-    velocities act on, ``now`` the one after the substep. The velocities on the nodes are those of the cloth: contact
-    forces act on the nodes between layers at every substep anew, and a director that followed them there would slowly
-    forget its compression (layers then sink into each other at a speed proportional to dt).
+    The velocities on the nodes are those of the cloth. Contact forces act on the nodes between layers at every substep
+    anew; a director that followed them there would slowly forget its compression, and layers would sink into each other
+    at a speed proportional to dt.
+
+    Args:
+        model: the model.
+        grid: the contact grid.
+        candidates: the active triangles. All other directors are set to the normals.
+        directors: what ``compute_director_forces`` returned; None: no triangle is active.
+        before: the surface at the start of the substep.
+        v: [..., V, 3] m/s, velocities at the end.
+        after: the surface at the end of the substep.
+        dt: length of the substep [s].
+
+    Returns:
+        The directors [..., P, 3], and how fast they close, -dR33/dt [..., P, 1] 1/s.
     """
     count = grid.points.shape[0]
-    d3 = now.n.repeat_interleave(count, dim=-2)
+    d3 = after.n.repeat_interleave(count, dim=-2)
     closing = torch.zeros_like(d3[..., :1])
-    if p is None:
+    if directors is None:
         return d3, closing
-    affine = _pick(layers, _mesh_gradient(model, v, s).flatten(-2), s.n).unflatten(-1, (3, 3))
-    gradient = velocity_gradient(p.nodes, p.mass, _points(grid, layers, v), _each(affine, count), grid.spacing)
-    moved = p.d3 + dt * (gradient @ p.d3.unsqueeze(-1)).squeeze(-1)
-    before, after = (field.unflatten(0, (-1, count)) for field in (p.d3, moved))
-    old, n = (_pick(layers, field, field).unsqueeze(-2) for field in (s.n, now.n))
-    height = dot(after, n)
-    mapped = model.material.return_map(coefficients_per_point(model, layers, s), n, after + grid.free_compression * n) - grid.free_compression * n
-    mapped = torch.where(height > 1 - grid.free_compression, height.clamp(max=1) * n, mapped)
-    rate = (dot(before, old) - height) / dt
-    return _put(layers, d3, mapped), _put(layers, closing, rate)
+    affine = _mesh_velocity_gradient(model, v, before).flatten(-2)
+    affine = _repeat_for_points(_select_active(candidates, affine, before.n).unflatten(-1, (3, 3)), count)
+    velocity = _at_points(grid, candidates, v)
+    gradient = velocity_gradient(directors.nodes, directors.mass, velocity, affine, grid.spacing)
+    carried = directors.d3 + dt * (gradient @ directors.d3.unsqueeze(-1)).squeeze(-1)
+    old_d3, new_d3 = (field.unflatten(0, (-1, count)) for field in (directors.d3, carried))
+    old_n, n = (_select_active(candidates, field, field).unsqueeze(-2) for field in (before.n, after.n))
+    height = dot(new_d3, n)
+    coefficients, free = coefficients_per_point(model, candidates, before), grid.free_compression
+    mapped = model.material.return_map(coefficients, n, new_d3 + free * n) - free * n
+    mapped = torch.where(height > 1 - free, height.clamp(max=1) * n, mapped)
+    rate = (dot(old_d3, old_n) - height) / dt
+    return _replace_active(candidates, d3, mapped), _replace_active(candidates, closing, rate)
 
 
 def director_energy(model: Model, grid: Grid, s: Surface, d3: Tensor) -> Tensor:
-    """[...] J, of all directors."""
+    """Compute the energy of all directors, [...] J."""
     count = grid.points.shape[0]
     c = type(model.coefficients)(*(k.unsqueeze(-2) for k in model.coefficients))
     n = s.n.unsqueeze(-2)
@@ -207,43 +270,42 @@ def director_energy(model: Model, grid: Grid, s: Surface, d3: Tensor) -> Tensor:
     return (s.area.unsqueeze(-2) / count * density).sum((-3, -2, -1))
 
 
-def _mesh_gradient(model: Model, v: Tensor, s: Surface) -> Tensor:
-    """Velocity gradient [..., E, 3, 3] 1/s of a sheet whose normal turns with it, exact for a rigid rotation."""
+def coefficients_per_point(model: Model, candidates: ContactCandidates, s: Surface) -> Any:
+    """Return the material's coefficients at the active triangles, with an axis for the contact points."""
+    coefficients = model.coefficients
+    return type(coefficients)(*(_select_active(candidates, c, s.n).unsqueeze(-2) for c in coefficients))
+
+
+def _mesh_velocity_gradient(model: Model, v: Tensor, s: Surface) -> Tensor:
+    """Return the velocity gradient [..., E, 3, 3] 1/s of a sheet whose normal turns with it; exact for rigid turns."""
     g = model.geometry
     v0, v1, v2 = corners(g, v)
     d1, d2 = v1 - v0, v2 - v0
     rate1 = g.warp[0] * d1 + g.warp[1] * d2
     rate2 = g.weft[0] * d1 + g.weft[1] * d2
     dual1, dual2 = s.cofactor1 / s.J, s.cofactor2 / s.J
-    spin = -(dot(rate1, s.n) * dual1 + dot(rate2, s.n) * dual2)  # rate of the normal
-    left = torch.stack([rate1, rate2, spin], dim=-1)
+    normal_rate = -(dot(rate1, s.n) * dual1 + dot(rate2, s.n) * dual2)
+    left = torch.stack([rate1, rate2, normal_rate], dim=-1)
     right = torch.stack([dual1, dual2, s.n], dim=-1)
     return left @ right.mT
 
 
-def _pick(layers: ContactCandidates, field: Tensor, like: Tensor) -> Tensor:
-    """Rows [A, K] of a field [..., E or 1, K] at the active triangles; ``like`` is [..., E, 3]."""
+def _select_active(candidates: ContactCandidates, field: Tensor, like: Tensor) -> Tensor:
+    """Return the rows [A, K] of a field [..., E or 1, K] at the active triangles; ``like`` is [..., E, 3]."""
     full = field.expand(*like.shape[:-1], field.shape[-1])
-    return full.reshape(-1, field.shape[-1]).index_select(0, layers.active)
+    return full.reshape(-1, field.shape[-1]).index_select(0, candidates.active)
 
 
-def _put(layers: ContactCandidates, field: Tensor, rows: Tensor) -> Tensor:
-    """The field [..., P, K] with the rows [A, S, K] of the active triangles replaced."""
-    return field.reshape(-1, *rows.shape[1:]).index_copy(0, layers.active, rows).view(field.shape)
+def _replace_active(candidates: ContactCandidates, field: Tensor, rows: Tensor) -> Tensor:
+    """Return the field [..., P, K] with the rows [A, S, K] of the active triangles replaced."""
+    return field.reshape(-1, *rows.shape[1:]).index_copy(0, candidates.active, rows).view(field.shape)
 
 
-def _each(rows: Tensor, count: int) -> Tensor:
-    """Rows of triangles repeated for their contact points."""
+def _repeat_for_points(rows: Tensor, count: int) -> Tensor:
     return rows.repeat_interleave(count, 0)
 
 
-def _points(grid: Grid, layers: ContactCandidates, field: Tensor) -> Tensor:
-    """Values [A S, 3] at the contact points of the active triangles."""
-    own = field.reshape(-1, 3).index_select(0, layers.vertices.flatten()).unflatten(0, (3, -1))
-    return torch.einsum("sc,cak->ask", grid.points, own).flatten(0, 1)
-
-
-def coefficients_per_point(model: Model, layers: ContactCandidates, s: Surface) -> Any:
-    """The material's coefficients at the active triangles, with an axis for the contact points."""
-    coefficients = model.coefficients
-    return type(coefficients)(*(_pick(layers, c, s.n).unsqueeze(-2) for c in coefficients))
+def _at_points(grid: Grid, candidates: ContactCandidates, field: Tensor) -> Tensor:
+    """Return a vertex field [..., V, 3] at the contact points of the active triangles, [A S, 3]."""
+    at_corners = field.reshape(-1, 3).index_select(0, candidates.vertices.flatten()).unflatten(0, (3, -1))
+    return torch.einsum("sc,cak->ask", grid.points, at_corners).flatten(0, 1)

@@ -39,13 +39,13 @@ def _box(low: Lowering, box: Box) -> Distance:
 
 
 def _capsule(low: Lowering, capsule: Capsule) -> Distance:
-    constants = _row(low, capsule.start, capsule.end - capsule.start, capsule.aside)
+    constants = _row(low, capsule.start, capsule.end - capsule.start, capsule.perpendicular)
     return _formula("capsule", low.parameter(capsule.radius.field), constants)
 
 
 def _cylinder(low: Lowering, bar: Cylinder) -> Distance:
     length = (bar.end - bar.start).norm(dim=-1, keepdim=True)
-    constants = ((bar.start + bar.end) / 2, (bar.end - bar.start) / length, length / 2, bar.aside)
+    constants = ((bar.start + bar.end) / 2, (bar.end - bar.start) / length, length / 2, bar.perpendicular)
     return _formula("cylinder", low.parameter(bar.radius.field), _row(low, *constants))
 
 
