@@ -11,11 +11,11 @@ from torchcloth.errors import InvalidInput, SimulationDiverged
 from torchcloth.planning import Goal
 from torchcloth.planning.episode_conversion import extract_motion_parameters
 from torchcloth.planning.forward_model import ForwardModel, exact_model
-from torchcloth.planning.task import Task
-from torchcloth.robots import ACCELERATION
-from torchcloth.robots.primitives import Limits
+from torchcloth.planning.task import PlanningTask
+from torchcloth.robots import DEFAULT_JOINT_ACCELERATION
+from torchcloth.robots.primitives import GripperLimits
 from torchcloth.training.rl import ReachEnv, learn
-from torchcloth.training.rl.env import Stepwise, stepwise
+from torchcloth.training.rl.env import StepwiseSpline, make_stepwise
 
 WAIT = 0.1
 
@@ -23,15 +23,20 @@ WAIT = 0.1
 def task_of(recording, way=(0.04, 0.02, 0.03), waypoints=2, judge=None):
     """Where the recorded motion's cloth would be if all were shifted."""
     cloth = cloth_of(recording).requires_grad_(False)
-    courses = [stepwise(c) for c in extract_motion_parameters(cloth, recording, waypoints, WAIT, ACCELERATION, Limits())]
+    courses = [
+        make_stepwise(c)
+        for c in extract_motion_parameters(
+            cloth, recording, waypoints, WAIT, DEFAULT_JOINT_ACCELERATION, GripperLimits()
+        )
+    ]
     run = ForwardModel(exact_model(cloth), recording, courses, None)
     with torch.no_grad():
         x = run.simulate({c.name: c.trajectory(c.zero_waypoints) for c in courses})[-1]
-    return Task([run], courses, Goal(x + torch.tensor(way), run.faces), judge, None)
+    return PlanningTask([run], courses, Goal(x + torch.tensor(way), run.faces), judge, None)
 
 
 def test_a_step_is_done_in_its_own_stretch_of_time():
-    span = Stepwise(0.0, 1.0, 4)
+    span = StepwiseSpline(0.0, 1.0, 4)
     share = span.basis(torch.tensor([0.0, 0.25, 0.5, 1.0, 2.0]))
     assert torch.allclose(share[1], torch.tensor([1.0, 0, 0, 0]))
     assert torch.allclose(share[2], torch.tensor([1.0, 1, 0, 0]))
@@ -51,8 +56,8 @@ def test_of_an_episode_it_is_what_is_planned_in():
     recording, wanted = by_arm(), task_of(by_arm(), waypoints=3)
     cloth = cloth_of(recording).requires_grad_(False)
     env = ReachEnv.of(cloth, recording, wanted.goal, waypoints=3, wait=WAIT)
-    assert env.stretches == 3
-    assert env.task.look(env.task.start) == wanted.look(wanted.start)
+    assert env.intervals == 3
+    assert env.task.evaluate(env.task.start) == wanted.evaluate(wanted.start)
     with pytest.raises(InvalidInput, match="waypoints"):
         ReachEnv.of(cloth, recording, wanted.goal, waypoints=0)
     with pytest.raises(InvalidInput, match="one Cloth"):
@@ -70,10 +75,10 @@ def test_step_by_step_the_cloth_goes_where_the_whole_motion_brings_it():
     for k, action in enumerate(actions):
         _, reward, over, _, info = env.step(action)
         assert over == (k == 2)
-        assert reward == pytest.approx(-info["distance"] / env.first)
+        assert reward == pytest.approx(-info["distance"] / env.recorded_distance)
     (last,) = tried
     assert last.distance == pytest.approx(info["distance"])
-    assert task.look(last.at)[0] == pytest.approx(last.distance, rel=2e-2)  # substeps of other lengths
+    assert task.evaluate(last.at)[0] == pytest.approx(last.distance, rel=2e-2)  # substeps of other lengths
     assert float(task.bounds.nearest_limit(last.at)[0]) <= 1.0
 
 
@@ -82,7 +87,7 @@ def test_what_is_in_the_way_is_not_stepped_into():
         def nearest(self, q):
             return None, "in the way" if float((q["arm"] - recorded).abs().max()) > 0.02 else None
 
-    course = task_of(by_arm()).courses[0]
+    course = task_of(by_arm()).motions[0]
     recorded = course.coordinates_at_check_times(course.zero_waypoints)
 
     env = ReachEnv(task_of(by_arm(), judge=Wall()))
@@ -104,13 +109,13 @@ def test_a_motion_that_cannot_be_simulated_ends_there(monkeypatch):
     _, reward, over, _, _ = env.step(np.zeros(env.count))
     assert over
     assert reward < -1
-    assert reward <= -5.0 * env.stretches  # to tear the cloth at once spares nothing
+    assert reward <= -5.0 * env.intervals  # to tear the cloth at once spares nothing
     assert tried[0].distance == np.inf
     assert env.reset()[0].shape == env.observation_space.shape
 
 
 def test_sac_comes_nearer():
-    found = learn(task_of(by_hand()), motions=60, warm=20)
+    found = learn(task_of(by_hand()), motions=60, random_motions=20)
     assert len(found.history) == 61
     assert found.history[-1] == found.policy
     assert min(found.history) < 0.6 * found.history[0]

@@ -39,18 +39,18 @@ def _confirm(options: argparse.Namespace) -> int:
     import torch
 
     from .. import diagnosis, recordings
-    from ..diagnosis.run import CONFIRMED
+    from ..diagnosis.run import CONFIRMATION_FILE
 
     torch.set_default_dtype(torch.float64)
     torch.set_num_threads(1)
-    out = options.extended.parent / CONFIRMED.parent if options.out is None else options.out
+    out = options.extended.parent / CONFIRMATION_FILE.parent if options.out is None else options.out
     check_outside_episodes(out, *options.episodes)
     check_output_folder(out)
     episodes = [recordings.read(path) for path in options.episodes]
     with show_progress_line() as progress:
         confirmation = diagnosis.confirm(options.base, options.extended, episodes, progress)
-    note = replacement_note(out / CONFIRMED.name)
-    path = write_text(out / CONFIRMED.name, to_json(confirmation.as_dict()))
+    note = replacement_note(out / CONFIRMATION_FILE.name)
+    path = write_text(out / CONFIRMATION_FILE.name, to_json(confirmation.as_dict()))
     _print(confirmation)
     print(f"result: {path}{note}")
     return 0

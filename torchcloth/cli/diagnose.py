@@ -37,16 +37,16 @@ def _diagnose(options: argparse.Namespace) -> int:
 
     from .. import diagnosis
     from .._utils.resume import clear_store
-    from ..diagnosis.experiment.feasibility import FOLDER
-    from ..diagnosis.report.html_report import REPORT
-    from ..diagnosis.run import RESULT
+    from ..diagnosis.experiment.feasibility import EXPERIMENT_FOLDER
+    from ..diagnosis.report.html_report import REPORT_FILE
+    from ..diagnosis.run import RESULT_FILE
 
     torch.set_default_dtype(torch.float64)
     torch.set_num_threads(1)
     check_outside_episodes(options.out, *options.episodes)
     check_output_folder(options.out)
     _check_model_not_replaced(options)
-    replaced = (options.out / RESULT).exists()
+    replaced = (options.out / RESULT_FILE).exists()
     if replaced:
         print_line(f"{options.out} holds a diagnosis, which this one will replace")
     episodes, faults = diagnosis.read_episodes(options.episodes)
@@ -55,7 +55,7 @@ def _diagnose(options: argparse.Namespace) -> int:
     else:
         model = None
         if options.model is not None:
-            model, episodes = diagnosis.begin_with(options.model, episodes)
+            model, episodes = diagnosis.start_from_model(options.model, episodes)
         streams = [e.markers if e.points is None else e.points for e in episodes]
         durations = [float(s.t[-1] - s.t[0]) for s in streams if s is not None]
         seconds, longest = sum(durations), max(durations, default=0.0)
@@ -81,8 +81,8 @@ def _diagnose(options: argparse.Namespace) -> int:
     print(answer.summary())
     new_warnings = [text for text in written.content["warnings"] if text not in answer.content["warnings"]]
     print("".join(f"Warning: {text}.\n" for text in new_warnings), end="")
-    experiment_folder = FOLDER if answer.experiment is not None and not new_warnings else None
-    files = (RESULT, REPORT, answer.content.get("base"), answer.content["model"], experiment_folder)
+    experiment_folder = EXPERIMENT_FOLDER if answer.experiment is not None and not new_warnings else None
+    files = (RESULT_FILE, REPORT_FILE, answer.content.get("base"), answer.content["model"], experiment_folder)
     print("\n".join(str(options.out / name) for name in files if name))
     if replaced:
         print("the earlier diagnosis in this folder was replaced")
@@ -91,9 +91,9 @@ def _diagnose(options: argparse.Namespace) -> int:
 
 def _check_model_not_replaced(options: argparse.Namespace) -> None:
     """Refuse an output folder whose new model files would replace the file of --model."""
-    from ..diagnosis.run import BASE, EXTENDED
+    from ..diagnosis.run import BASE_MODEL_FILE, EXTENDED_MODEL_FILE
 
-    replaced_models = [(options.out / name).resolve() for name in (BASE, EXTENDED)]
+    replaced_models = [(options.out / name).resolve() for name in (BASE_MODEL_FILE, EXTENDED_MODEL_FILE)]
     if options.model is not None and Path(options.model).resolve() in replaced_models:
         raise InvalidInput(
             "--out",

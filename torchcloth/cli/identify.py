@@ -218,7 +218,7 @@ def describe_causes_outside_cloth(model: WorldModel) -> list[str]:
     from .. import diagnosis
 
     notes = []
-    for name, amplitude in diagnosis.beside_the_cloth(model).items():
+    for name, amplitude in diagnosis.list_causes_outside_cloth(model).items():
         allowed = NUISANCE_OF_CAUSE.get(name.partition("[")[0])
         remedy = f"--nuisance {allowed} allows for it" if allowed else "no option allows for it"
         notes.append(f"{name} = {amplitude:.4g} of the model belongs to robot or camera, not to the cloth: {remedy}")
@@ -324,12 +324,12 @@ def _should_refine(options: argparse.Namespace) -> bool:
 def _report(options: argparse.Namespace, fit: Identification, cloth: Cloth, recordings: list[Recording]) -> int:
     from .._utils.resume import clear_store
     from ..identification import build_episode
-    from ..identification.io.saved_fit import RESULT
     from ..identification.pictures import save_fit_pictures
+    from ..identification.result import IDENTIFICATION_FILE_NAME
     from ..identification.tables import print_fit
 
     folder = options.out
-    note = replacement_note(folder / RESULT)
+    note = replacement_note(folder / IDENTIFICATION_FILE_NAME)
     path = fit.save(folder, options.model)
     pictures = save_fit_pictures(fit, [build_episode(cloth, r) for r in recordings], cloth.mesh.faces, folder)
     clear_store(folder / PROGRESS_FOLDER_NAME)

@@ -113,10 +113,10 @@ def report(folder: Path, fit: FieldFit, cloth: Cloth) -> int:
     from rich.table import Table
 
     from .._utils.resume import clear_store
-    from ..identification.fields import RESULT
+    from ..identification.fields import FIELDS_FILE_NAME
     from ..identification.pictures import plot_fields, save_figure
 
-    note = replacement_note(folder / RESULT)
+    note = replacement_note(folder / FIELDS_FILE_NAME)
     path = fit.save(folder)
     picture = save_figure(plot_fields(fit.fields, cloth), folder / "fields.png")
     clear_store(folder / PROGRESS_FOLDER_NAME)  # before anything is printed, to somebody who may stop reading

@@ -9,7 +9,7 @@ from typing import Any
 from .._utils.files import write_text
 from .output_paths import check_output_folder, check_outside_episodes, output_path, replacement_note
 
-RESULT = "inspection.json"
+INSPECTION_FILE_NAME = "inspection.json"
 
 
 def add(verbs: Any) -> None:
@@ -37,9 +37,9 @@ def _inspect(options: argparse.Namespace) -> int:
     text = json.dumps(report.as_dict(), indent=1, allow_nan=False) + "\n"
     written = ""
     if options.out is not None:  # before printing, which fails if the reader closes the pipe
-        note = replacement_note(options.out / RESULT)
+        note = replacement_note(options.out / INSPECTION_FILE_NAME)
         picture = inspection.draw(report, options.out)
-        written = f"result:  {write_text(options.out / RESULT, text)}{note}\npicture: {picture}\n"
+        written = f"result:  {write_text(options.out / INSPECTION_FILE_NAME, text)}{note}\npicture: {picture}\n"
     if options.json:
         print(text, end="")
     else:

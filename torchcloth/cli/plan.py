@@ -156,8 +156,10 @@ def _models(options: argparse.Namespace, recording: Recording) -> list[Cloth] | 
             raise InvalidInput("--samples", got="it without --fit", expected="--fit as well")
         return [build_cloth(recording)]
     if options.fit.suffix == ".tcm":
-        return diagnosis.drawn_models(diagnosis.read_model(options.fit, recording), options.samples)
-    return sample_posterior(options.fit, recording, options.samples, build_start=diagnosis.start_of(options.fit))
+        return diagnosis.draw_models(diagnosis.read_model(options.fit, recording), options.samples)
+    return sample_posterior(
+        options.fit, recording, options.samples, build_start=diagnosis.make_start_builder(options.fit)
+    )
 
 
 def _progress_text(number: int, distance: float, best: float) -> str:

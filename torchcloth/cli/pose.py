@@ -102,7 +102,7 @@ def _was_fitted_to(fit: Path, recording: Recording) -> bool:
 
 def _model(options: argparse.Namespace, recording: Recording) -> tuple[Cloth, dict[str, tuple[float, float]]]:
     """Return the cloth, and value and spread of each uncertain parameter."""
-    from ..diagnosis import start_of
+    from ..diagnosis import make_start_builder
     from ..episodes.unknowns import find_scalar_parameters
     from ..identification import build_cloth, load_fitted_cloth
 
@@ -111,7 +111,7 @@ def _model(options: argparse.Namespace, recording: Recording) -> tuple[Cloth, di
     elif options.fit.suffix == ".tcm":
         cloth, uncertain = _cloth_from_model(options.fit, recording)
     else:
-        cloth, uncertain = load_fitted_cloth(options.fit, recording, start_of(options.fit))
+        cloth, uncertain = load_fitted_cloth(options.fit, recording, make_start_builder(options.fit))
     names = find_scalar_parameters(cloth)
     for name, spread in parse_assignments(options.uncertainty, "--uncertainty").items():
         if name not in names:
@@ -126,7 +126,7 @@ def _cloth_from_model(path: Path, recording: Recording) -> tuple[Cloth, dict[str
     file = diagnosis.read_model(path, recording)
     for note in describe_causes_outside_cloth(file.model):
         print(f"note: {note}")
-    return file.model.build_world().cloth, diagnosis.uncertain(file)
+    return file.model.build_world().cloth, diagnosis.derive_priors(file)
 
 
 def _estimate(

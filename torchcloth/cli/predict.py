@@ -11,7 +11,7 @@ from .._utils.files import to_json, write_text
 from ..errors import InvalidInput
 from .output_paths import check_output_folder, check_outside_episodes, output_path, replacement_note
 
-RESULT = "prediction.json"
+PREDICTION_FILE_NAME = "prediction.json"
 TENSION_TABLE_FILE = "table.json"  # in a folder with readings of a tension machine
 STRIP_OPTIONS = ("angle", "length", "width", "preload", "strain")  # not for episodes
 
@@ -60,8 +60,8 @@ def add(verbs: Any) -> None:
 def _predict(options: argparse.Namespace) -> int:
     import torch
 
-    from ..identification.io.saved_fit import RESULT
-    from ..identification.tension.model import RESULT as TENSION
+    from ..identification.result import IDENTIFICATION_FILE_NAME
+    from ..identification.tension.model import RESULT as TENSION_FILE_NAME
 
     torch.set_default_dtype(torch.float64)
     torch.set_num_threads(1)
@@ -76,22 +76,26 @@ def _predict(options: argparse.Namespace) -> int:
     is_strip = strip_values or (options.data is not None and (options.data / TENSION_TABLE_FILE).is_file())
     if options.fit.suffix == ".tcm" and not is_strip:
         return _predict_episode(options.fit, out, options)
-    available = [name for name in (TENSION, RESULT) if (folder / name).is_file()]
+    available = [name for name in (TENSION_FILE_NAME, IDENTIFICATION_FILE_NAME) if (folder / name).is_file()]
     if not options.fit.is_dir():
         readable = options.fit.is_file() and (options.fit.suffix == ".tcm" or options.fit.name in available)
         available = [options.fit.name] if readable else []
     if not available:
         models = ", ".join(sorted(map(str, folder.glob("*.tcm"))))
-        expected = f"{TENSION}, {RESULT} or the folder that holds it, or a .tcm file"
+        expected = f"{TENSION_FILE_NAME}, {IDENTIFICATION_FILE_NAME} or the folder that holds it, or a .tcm file"
         remedy = f"name a model: {models}" if models else "correct the path"
         raise InvalidInput("FIT", got=options.fit, expected=expected, remedy=remedy)
-    name = TENSION if is_strip or (options.data is None and available == [TENSION]) else RESULT
+    name = (
+        TENSION_FILE_NAME
+        if is_strip or (options.data is None and available == [TENSION_FILE_NAME])
+        else IDENTIFICATION_FILE_NAME
+    )
     if name not in available:
         kind = "a strip" if is_strip else "an episode"
         numbers = ", ".join(f"--{name}" for name in STRIP_OPTIONS)
         needed = f"tables and {numbers} need a fit of tension tables" if is_strip else "episodes need a fit of episodes"
         raise InvalidInput("FIT", got=f"{available[0]} with {kind} to predict", expected=name, remedy=needed)
-    return (_predict_strip if name == TENSION else _predict_episode)(folder / name, out, options)
+    return (_predict_strip if name == TENSION_FILE_NAME else _predict_episode)(folder / name, out, options)
 
 
 def _predict_strip(fit: Path, out: Path, options: argparse.Namespace) -> int:
@@ -108,7 +112,7 @@ def _predict_strip(fit: Path, out: Path, options: argparse.Namespace) -> int:
     else:
         size = dict(zip(("length", "width", "preload", "strain"), strip_values, strict=True))
         prediction = predict_tension(model, *make_specimen(model, math.radians(options.angle), **size))
-    note = replacement_note(out / RESULT)
+    note = replacement_note(out / PREDICTION_FILE_NAME)
     path = _write(out, prediction.as_dict())
     picture = pictures.save_figure(prediction_report.plot_tension_prediction(prediction), out / "prediction.png")
     prediction_report.print_tension_prediction(prediction)
@@ -119,17 +123,19 @@ def _predict_strip(fit: Path, out: Path, options: argparse.Namespace) -> int:
 def _predict_episode(fit: Path, out: Path, options: argparse.Namespace) -> int:
     import numpy as np
 
-    from .. import recordings
+    from .. import diagnosis, recordings
     from .._utils.files import write_atomically
-    from ..diagnosis import predicted, start_of, was_fitted
     from ..identification import is_fitted_episode, pictures, predict_episode, prediction_report
 
     if options.data is None:
         raise InvalidInput("DATA", got="none", expected="an episode whose motion is to be predicted")
     recording = recordings.read(options.data)
-    of_model = fit.suffix == ".tcm"
-    prediction = predicted(fit, recording) if of_model else predict_episode(fit, recording, start_of(fit))
-    note = replacement_note(out / RESULT)
+    is_model = fit.suffix == ".tcm"
+    if is_model:
+        prediction = diagnosis.predict_episode(fit, recording)
+    else:
+        prediction = predict_episode(fit, recording, diagnosis.make_start_builder(fit))
+    note = replacement_note(out / PREDICTION_FILE_NAME)
     path = _write(out, prediction.as_dict())
     with write_atomically(out / "prediction.npz") as file:
         t, vertices, std = (
@@ -139,11 +145,11 @@ def _predict_episode(fit: Path, out: Path, options: argparse.Namespace) -> int:
         np.savez_compressed(file, t=t, vertices=vertices, std=std, interval=interval, faces=faces)
     picture = pictures.save_figure(prediction_report.plot_episode_prediction(prediction), out / "prediction.png")
     prediction_report.print_episode_prediction(prediction)
-    if was_fitted(fit, recording) if of_model else is_fitted_episode(fit, recording):
+    if diagnosis.was_fitted(fit, recording) if is_model else is_fitted_episode(fit, recording):
         print("note: the fit used this episode, so its distances are residuals and not prediction errors")
     print(f"result:   {path}{note}\nframes:   {out / 'prediction.npz'}\npicture:  {picture}")
     return 0
 
 
 def _write(out: Path, content: dict[str, Any]) -> Path:
-    return write_text(out / RESULT, to_json(content))
+    return write_text(out / PREDICTION_FILE_NAME, to_json(content))

@@ -99,7 +99,7 @@ def _film(options: argparse.Namespace) -> Film:
         film = viewing.film_from_recording(recording, truth=options.truth)
     else:
         film = viewing.film_from_fit(recording, options.fit, truth=options.truth)
-    return film if options.fps is None else film.at_most(options.fps)
+    return film if options.fps is None else film.limit_rate(options.fps)
 
 
 def _write(film: Film, out: Path, size: tuple[int, int] | None, fps: float | None) -> None:

@@ -125,7 +125,7 @@ def _depth_clouds(
     clouds, notes = {}, []
     for name, view in views.items():
         try:
-            camera = DepthCamera.of(view.camera)
+            camera = DepthCamera.from_recording(view.camera)
         except InvalidInput as error:
             notes.append(f"depth of {name!r} is not drawn: {error}")
             continue

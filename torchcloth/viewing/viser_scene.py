@@ -40,12 +40,12 @@ def import_viser() -> Any:
         MissingDependency: viser is not installed.
     """
     try:
-        import import_viser
+        import viser
     except ImportError as error:
         raise MissingDependency(
             "viewing in a browser needs viser", got=str(error), remedy='pip install "torchcloth[viz]"'
         ) from error
-    return import_viser
+    return viser
 
 
 class ViserScene:

@@ -1,4 +1,4 @@
-"""Reinforcement learning on the same scenes as ``torchcloth plan``; needs the extra ``rl``."""
+"""Reinforcement learning in the scenes of ``torchcloth plan``; needs the extra ``rl``."""
 
 from .env import ReachEnv
 from .sac import learn

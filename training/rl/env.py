@@ -1,7 +1,7 @@
-"""A cloth in grippers as a gymnasium environment: decision after decision, how far to go, until the motion is over.
+"""A cloth in grippers as a gymnasium environment: each action adds a step to the grippers' motion.
 
-The scene, the limits and what is in the way are those of ``torchcloth plan``. Decisions are causal: each adds a smooth
-step (quintic, at rest at both ends) within its own stretch of time.
+The scene, the limits and the obstacles are those of ``torchcloth plan``. Actions are causal: each adds a smooth step
+(quintic, at rest at both ends) within its own interval of time.
 """
 
 from __future__ import annotations
@@ -19,75 +19,83 @@ from torch import Tensor
 from torchcloth.cloth import Cloth
 from torchcloth.errors import InvalidInput, MissingDependency, SimulationDiverged
 from torchcloth.planning import Goal
-from torchcloth.planning.constrained_step import step_within
-from torchcloth.planning.motion_parameters import Course, Span
-from torchcloth.planning.problem import Asked, posed
-from torchcloth.planning.task import Task
+from torchcloth.planning.constrained_step import solve_constrained_step
+from torchcloth.planning.motion_parameters import GripperMotionParameters, SplineSpan
+from torchcloth.planning.problem import PlanOptions, build_problem
+from torchcloth.planning.task import PlanningTask
 from torchcloth.recordings import Recording
-from torchcloth.robots import ACCELERATION  # pyright: ignore[reportMissingImports] - mapped from robots/
-from torchcloth.robots.primitives import Limits  # pyright: ignore[reportMissingImports]
+from torchcloth.robots import DEFAULT_JOINT_ACCELERATION  # pyright: ignore[reportMissingImports] - mapped from robots/
+from torchcloth.robots.primitives import GripperLimits  # pyright: ignore[reportMissingImports]
 
 try:
     import gymnasium
 except ImportError as error:
     raise MissingDependency("reinforcement learning needs gymnasium", remedy='pip install "torchcloth[rl]"') from error
 
-SEEN = 32  # vertices that are observed, far apart
-SIZE = 0.5  # m, that observations are divided by
-TORN = 5.0  # of the recorded motion's distance, that a motion counts that cannot be simulated
+OBSERVED_VERTICES = 32  # spread over the cloth
+LENGTH_SCALE_M = 0.5  # by which observed positions are divided
+TORN_PENALTY = 5.0  # cost of an unstable simulation, in units of the recorded motion's distance
 
 
-class Stepwise(Span):
-    """What is added is added step by step: waypoint k from the end of stretch k - 1 to the end of stretch k."""
+class StepwiseSpline(SplineSpan):
+    """Spline of steps: waypoint k is added from the end of interval k - 1 to the end of interval k."""
 
     def basis(self, times: Tensor) -> Tensor:
-        """[N, K], the share of each step that is done at ``times`` [N] s."""
+        """Return [N, K] the fraction of each step that is done at ``times`` [N] s."""
         ends = torch.linspace(self.begin, self.end, self.waypoints + 1, dtype=torch.float64)
         s = ((times.double()[:, None] - ends[:-1]) / ends.diff()).clamp(0.0, 1.0)
         return s**3 * (10 - 15 * s + 6 * s * s)
 
 
-def stepwise(course: Course) -> Course:
-    """The same gripper, to which steps are added."""
-    return replace(course, span=Stepwise(*course.span))
+def make_stepwise(course: GripperMotionParameters) -> GripperMotionParameters:
+    """Return the parameters of a gripper whose motion is changed by steps."""
+    return replace(course, span=StepwiseSpline(*course.span))
 
 
-class Tried(NamedTuple):
-    """One finished motion."""
+class FinishedMotion(NamedTuple):
+    """A finished motion.
 
-    distance: float  # m, from the goal at the end
-    at: Tensor  # [N] steps, as ``Task`` has unknowns
+    Attributes:
+        distance: from the goal at the end [m]; infinite if the simulation was unstable.
+        at: [N] steps, the unknowns of the planning task.
+    """
+
+    distance: float
+    at: Tensor
 
 
 class ReachEnv(gymnasium.Env):
-    """One episode is one motion of the grippers; each action is one step of all of them.
+    """Environment in which an episode is one motion of the grippers and an action is one step of all grippers.
 
-    Observation: places of some vertices from the goal's middle, their velocities, where the grippers' coordinates have
-    gone, and how much of the motion is over. Action: the step of every coordinate, as a share of the largest that the
-    limits allow. Reward: minus the distance from the goal over that of the recorded motion's end, after every step;
-    where cloth is torn, what ends the motion, for every step that is left as much as the last, and 5 at least.
+    Observation: positions of some vertices relative to the goal's centre, their velocities, the steps so far, and the
+    fraction of the motion that is done.
+    Action: step of each coordinate as a fraction of the largest step within the limits.
+    Reward: after each step, minus the distance from the goal divided by that of the recorded motion's end. If the
+    simulation becomes unstable, the motion ends; each remaining step costs as much as the last one, and 5 at least.
 
     Args:
-        task: with ``stepwise`` courses and one model.
-        on_motion: called after every finished motion.
+        task: planning task with one model, whose motions are ``make_stepwise``.
+        on_motion: called after each finished motion.
     """
 
     metadata: dict[str, Any] = {"render_modes": []}
 
-    def __init__(self, task: Task, on_motion: Callable[[Tried], None] = lambda tried: None) -> None:
+    def __init__(self, task: PlanningTask, on_motion: Callable[[FinishedMotion], None] = lambda tried: None) -> None:
         self.task, self.on_motion = task, on_motion
-        self.run = task.rehearsals[0]
-        course = task.courses[0]
-        self.stretches = course.span.waypoints
-        self.ends = np.linspace(course.span.begin, course.span.end, self.stretches + 1)
+        self.run = task.forward_models[0]
+        course = task.motions[0]
+        self.intervals = course.span.waypoints
+        self.ends = np.linspace(course.span.begin, course.span.end, self.intervals + 1)
         self.last = float(course.t[-1])  # of the wait
-        numbered = task.split(torch.arange(len(task.start)))
-        self.own = [torch.cat([z[k] for z in numbered]) for k in range(self.stretches)]  # unknowns of each stretch
-        self.count = len(self.own[0])
-        self.vertices = _far_apart(self.run.state.x, SEEN)
+        numbered = task.split_waypoints(torch.arange(len(task.start)))
+        self.interval_unknowns = [
+            torch.cat([z[k] for z in numbered]) for k in range(self.intervals)
+        ]  # unknowns of each stretch
+        self.count = len(self.interval_unknowns[0])
+        self.vertices = _spread_vertices(self.run.state.x, OBSERVED_VERTICES)
         self.middle = task.goal.points.mean(0).to(self.run.state.x)
-        self.first = max(task.look(task.start)[0], 1e-9)
-        self.reach = _reach(task)
+        self.recorded_distance = max(task.evaluate(task.start)[0], 1e-9)
+        self.reach = _largest_steps(task)
         size = 6 * len(self.vertices) + self.count + 1
         self.observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (size,), np.float32)
         self.action_space = gymnasium.spaces.Box(-1.0, 1.0, (self.count,), np.float32)
@@ -101,84 +109,90 @@ class ReachEnv(gymnasium.Env):
         *,
         waypoints: int = 4,
         wait: float = 0.3,
-        acceleration: float = ACCELERATION,
-        limits: Limits = Limits(),  # noqa: B008 - a tuple
+        acceleration: float = DEFAULT_JOINT_ACCELERATION,
+        limits: GripperLimits = GripperLimits(),  # noqa: B008 - a tuple
         clearance: float = 0.02,
         dt: float | None = None,
     ) -> ReachEnv:
-        """The scene of ``tc.plan`` with the same arguments, with one decision for each waypoint; doubts are warnings.
+        """Build the environment from the arguments of ``tc.plan``, with one action for each waypoint.
 
         Raises:
-            InvalidInput: no cloth, or as ``tc.plan``.
-            RecordingError: as there.
+            InvalidInput: ``cloth`` is no Cloth, or see ``tc.plan``.
+            RecordingError: see ``tc.plan``.
         """
         if not isinstance(cloth, Cloth):
             raise InvalidInput("cloth", got=type(cloth).__name__, expected="one Cloth")
-        asked = Asked(waypoints, wait, acceleration, limits, clearance, dt)
-        task, doubts = posed(cloth, recording, goal, asked, course=stepwise)
-        for doubt in doubts:
-            warnings.warn(doubt, stacklevel=2)
+        options = PlanOptions(waypoints, wait, acceleration, limits, clearance, dt)
+        task, planning_warnings = build_problem(cloth, recording, goal, options, adapt_motion=make_stepwise)
+        for text in planning_warnings:
+            warnings.warn(text, stacklevel=2)
         return cls(task)
 
     def reset(self, *, seed: int | None = None, options: Mapping[str, Any] | None = None):
-        """The cloth at rest where it is first."""
+        """Reset the cloth to its first shape at rest."""
         super().reset(seed=seed)
         self.at, self.done, self.state = self.task.start.clone(), 0, self.run.state
-        self.away = float(self.task.aims[0].distance(self.state.x))
-        return self._seen(), {}
+        self.away = float(self.task.objectives[0].distance(self.state.x))
+        return self._observation(), {}
 
     def step(self, action: np.ndarray):
-        """One stretch of time; the last one with the wait."""
+        """Simulate one interval of time; the last one includes the wait."""
         k = self.done
-        share = torch.as_tensor(np.asarray(action, dtype=np.float64)).clamp(-1.0, 1.0)
-        up, down = (reach[self.own[k]] for reach in self.reach)
-        wanted = share * torch.where(share > 0, up, down)
+        fraction = torch.as_tensor(np.asarray(action, dtype=np.float64)).clamp(-1.0, 1.0)
+        largest_up, largest_down = (reach[self.interval_unknowns[k]] for reach in self.reach)
+        wanted = fraction * torch.where(fraction > 0, largest_up, largest_down)
         after = self.at.clone()
-        after[self.own[k]] = self._allowed(k, wanted)
-        if self.task.clear(after):
+        after[self.interval_unknowns[k]] = self._limit_steps(k, wanted)
+        if self.task.is_clear(after):
             self.at = after
         self.done += 1
-        over = self.done == self.stretches
-        end = self.last if over else float(self.ends[self.done])
+        is_over = self.done == self.intervals
+        end = self.last if is_over else float(self.ends[self.done])
         try:
             with torch.no_grad():
-                self.state = self.run.go_on(self.state, self.task.motion(self.at), float(self.ends[k]), end)
-            distance = self.away = float(self.task.aims[0].distance(self.state.x))
-            reward = -distance / self.first
-        except SimulationDiverged:  # cloth that is torn: the motion ends, and nothing is gained by ending it early
-            distance, over = math.inf, True
-            reward = -(self.stretches - k) * max(TORN, self.away / self.first)
-        if over:
-            self.on_motion(Tried(distance, self.at))
-        return self._seen(), reward, over, False, {"distance": distance}
+                self.state = self.run.simulate_interval(self.state, self.task.motion(self.at), float(self.ends[k]), end)
+            distance = self.away = float(self.task.objectives[0].distance(self.state.x))
+            reward = -distance / self.recorded_distance
+        except SimulationDiverged:  # the motion ends; the penalty makes sure that an early end does not pay off
+            distance, is_over = math.inf, True
+            reward = -(self.intervals - k) * max(TORN_PENALTY, self.away / self.recorded_distance)
+        if is_over:
+            self.on_motion(FinishedMotion(distance, self.at))
+        return self._observation(), reward, is_over, False, {"distance": distance}
 
-    def _allowed(self, k: int, wanted: Tensor) -> Tensor:
-        """The steps of stretch ``k`` nearest to these that keep the limits after what has been done."""
+    def _limit_steps(self, k: int, wanted: Tensor) -> Tensor:
+        """Return the steps of interval ``k`` that are nearest to the wanted ones within the limits."""
         bounds, done = self.task.bounds, self.task.bounds.rows @ self.at
-        own = self.own[k]
-        left = bounds._replace(
-            rows=bounds.rows[:, own], low=bounds.low - done, high=bounds.high - done, groups=bounds.groups[own]
-        )
-        return step_within(torch.zeros_like(wanted), -wanted, torch.eye(len(wanted)).to(wanted), left)
+        interval_unknowns = self.interval_unknowns[k]
+        left = bounds._replace(rows=bounds.rows[:, interval_unknowns], low=bounds.low - done, high=bounds.high - done)
+        return solve_constrained_step(torch.zeros_like(wanted), -wanted, torch.eye(len(wanted)).to(wanted), left)
 
-    def _seen(self) -> np.ndarray:
+    def _observation(self) -> np.ndarray:
         x, v = self.state.x[self.vertices] - self.middle, self.state.v[self.vertices]
-        gone = torch.cat([z.sum(0) for z in self.task.split(self.at)])
-        parts = [(x / SIZE).flatten(), v.flatten(), gone, gone.new_tensor([self.done / self.stretches])]
+        steps_so_far = torch.cat([z.sum(0) for z in self.task.split_waypoints(self.at)])
+        parts = [
+            (x / LENGTH_SCALE_M).flatten(),
+            v.flatten(),
+            steps_so_far,
+            steps_so_far.new_tensor([self.done / self.intervals]),
+        ]
         return torch.cat(parts).numpy().astype(np.float32)
 
 
-def _reach(task: Task) -> tuple[Tensor, Tensor]:
-    """[N] each, the largest step of each coordinate alone that the limits allow, up and down."""
+def _largest_steps(task: PlanningTask) -> tuple[Tensor, Tensor]:
+    """Return [N] and [N], the largest steps of each coordinate alone within the limits, up and down."""
     rows, high, low = task.bounds.rows, task.bounds.high[:, None], task.bounds.low[:, None]
-    most = lambda way: torch.where(  # noqa: E731
-        way * rows > 1e-12, high / (way * rows), torch.where(way * rows < -1e-12, low / (way * rows), torch.inf)
-    ).amin(0)
-    return most(1.0), most(-1.0)
+
+    def largest_step(sign: float) -> Tensor:
+        change = sign * rows
+        limit = torch.where(change < -1e-12, low / change, torch.inf)
+        return torch.where(change > 1e-12, high / change, limit).amin(0)
+
+    return largest_step(1.0), largest_step(-1.0)
 
 
-def _far_apart(x: Tensor, count: int) -> Tensor:
-    """Indices of vertices, each the farthest from those before."""
+def _spread_vertices(x: Tensor, count: int) -> Tensor:
+    """Return indices of vertices by farthest-point sampling."""
     chosen, distance = [0], (x - x[0]).norm(dim=1)
     while len(chosen) < min(count, len(x)):
         chosen.append(int(distance.argmax()))

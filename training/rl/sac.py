@@ -1,4 +1,4 @@
-"""Soft Actor-Critic (Haarnoja et al. 2018) on a cloth, by stable-baselines3."""
+"""Learn motions by Soft Actor-Critic (Haarnoja et al. 2018) from stable-baselines3."""
 
 from __future__ import annotations
 
@@ -10,18 +10,18 @@ import torch
 from torch import Tensor
 
 from torchcloth.errors import MissingDependency
-from torchcloth.planning.task import Task
+from torchcloth.planning.task import PlanningTask
 
-from .env import ReachEnv, Tried
+from .env import FinishedMotion, ReachEnv
 
 
-class Learnt(NamedTuple):
-    """What learning has found.
+class LearningResult(NamedTuple):
+    """Result of learning.
 
     Attributes:
-        best: [N] steps of the best motion that was tried.
-        history: m, the distance of every motion that was tried, in order, the final policy's last.
-        policy: m, where that ends, without exploring.
+        best: [N] steps of the best motion.
+        history: distances of all motions [m], in order; the last one is that of the final policy.
+        policy: distance of the final policy without exploration [m].
     """
 
     best: Tensor
@@ -29,14 +29,14 @@ class Learnt(NamedTuple):
     policy: float
 
 
-def learn(task: Task, motions: int, seed: int = 0, warm: int = 10) -> Learnt:
-    """Learn to reach the goal from so many motions.
+def learn(task: PlanningTask, motions: int, seed: int = 0, random_motions: int = 10) -> LearningResult:
+    """Learn to reach the goal.
 
     Args:
-        task: with ``stepwise`` courses and one model.
-        motions: that are simulated.
+        task: planning task with one model, whose motions are ``make_stepwise``.
+        motions: number of simulated motions.
         seed: of networks and exploration.
-        warm: motions with random steps, before learning begins.
+        random_motions: number of motions with random steps before learning begins.
 
     Raises:
         MissingDependency: stable-baselines3 is not installed.
@@ -48,24 +48,28 @@ def learn(task: Task, motions: int, seed: int = 0, warm: int = 10) -> Learnt:
     except ImportError as error:
         remedy = 'pip install "torchcloth[rl]"'
         raise MissingDependency("SAC needs stable-baselines3", remedy=remedy) from error
-    tried: list[Tried] = []
-    env = ReachEnv(task, tried.append)
+    motions_tried: list[FinishedMotion] = []
+    env = ReachEnv(task, motions_tried.append)
     before, torch_type = torch.get_num_threads(), torch.get_default_dtype()
-    drawn = random.getstate(), np.random.get_state(), torch.get_rng_state()  # noqa: NPY002 - seeded by it
-    torch.set_num_threads(1)  # networks are small: more threads take tens of times as long
-    torch.set_default_dtype(torch.float32)  # as its networks want; the cloth keeps its own
+    random_states = random.getstate(), np.random.get_state(), torch.get_rng_state()  # noqa: NPY002 - seeded by it
+    torch.set_num_threads(1)  # the networks are small; more threads take tens of times as long
+    torch.set_default_dtype(torch.float32)  # required by the networks; the cloth keeps its own type
     try:
-        model = SAC("MlpPolicy", env, seed=seed, learning_starts=warm * env.stretches, gradient_steps=1, device="cpu")
-        model.set_logger(Logger(None, []))  # else it makes a folder
-        model.learn(motions * env.stretches, StopTrainingOnMaxEpisodes(motions))  # torn cloth ends one early
-        seen, over = env.reset()[0], False
-        while not over:
-            seen, _, over, _, _ = env.step(model.predict(seen, deterministic=True)[0])
+        model = SAC(
+            "MlpPolicy", env, seed=seed, learning_starts=random_motions * env.intervals, gradient_steps=1, device="cpu"
+        )
+        model.set_logger(Logger(None, []))  # otherwise a folder is made
+        model.learn(
+            motions * env.intervals, StopTrainingOnMaxEpisodes(motions)
+        )  # an unstable simulation ends one early
+        observation, is_over = env.reset()[0], False
+        while not is_over:
+            observation, _, is_over, _, _ = env.step(model.predict(observation, deterministic=True)[0])
     finally:
         torch.set_num_threads(before)
         torch.set_default_dtype(torch_type)
-        random.setstate(drawn[0])
-        np.random.set_state(drawn[1])  # noqa: NPY002
-        torch.set_rng_state(drawn[2])
-    best = min(tried, key=lambda t: t.distance)
-    return Learnt(best.at, [t.distance for t in tried], tried[-1].distance)
+        random.setstate(random_states[0])
+        np.random.set_state(random_states[1])  # noqa: NPY002
+        torch.set_rng_state(random_states[2])
+    best = min(motions_tried, key=lambda t: t.distance)
+    return LearningResult(best.at, [t.distance for t in motions_tried], motions_tried[-1].distance)
