@@ -1,20 +1,28 @@
-"""What a simulation gets wrong, why, and what mending it gains.
+"""What a simulation gets wrong, why, and what correcting it gains.
 
-``diagnose`` runs all stages; each can be called alone: ``check``, ``base_model``, ``setting_of``, ``approach``,
-``gather``, ``fit_noise``, ``fit``, ``unstable``, ``screen``, ``correlations``, ``predict``, ``compare``, ``placebo``,
-``search``, ``doubted``, ``judge``, ``lack_of_fit``, ``drifts``, ``missing_force``, ``learn_residual``, ``propose``.
-Read ``stepwise.py`` and ``trials.py`` first.
+``diagnose`` runs all stages in this order; each can be called alone:
+
+1. ``check_episodes``, ``build_base_model``, ``list_hypotheses``, ``prepare_data``: data, model and hypotheses.
+2. ``search``: ``quadratic_warm_start``, ``fit`` (``linearise``, ``fit_noise``), ``find_bifurcating_bins``, ``screen``,
+   ``predict_held_out``, ``compare``, ``run_permutation_test``. ``decide/criteria.py`` lists all thresholds and the
+   gates that apply them.
+3. ``check_against_laws``, ``measure_lack_of_fit``, ``estimate_force_drifts``, ``estimate_missing_force``,
+   ``learn_residual_force``: what no known cause explains.
+4. ``judge``, ``propose_experiment``, ``write_diagnosis``: verdict, next experiment and files.
+
+``confirm`` measures the gain on new episodes.
 """
 
-from ..episodes.world import Hypothesis, Model, World
-from .causes.hypotheses import catalogue, register
+from ..episodes.world import Hypothesis, World, WorldModel
+from .causes.hypotheses import list_hypotheses, register
 from .causes.user_hypotheses import register_file
 from .confirmation import Confirmation, confirm
 from .data.data_checks import Fault, check_episodes, read_episodes
 from .data.dataset import prepare_data
+from .decide.criteria import CRITERIA, Criteria
 from .decide.search import search
 from .decide.verdict import Diagnosis, judge, refuse
-from .experiment.proposal import propose
+from .experiment.proposal import propose_experiment
 from .inference.bifurcations import find_bifurcating_bins
 from .inference.comparison import Gain, compare, predict_held_out
 from .inference.confounding import correlate_scores
@@ -26,75 +34,77 @@ from .inference.noise import fit_noise
 from .inference.permutation_test import run_permutation_test
 from .inference.screening import screen
 from .inference.warm_start import quadratic_warm_start
-from .models.base_model import base_model
+from .models.base_model import build_base_model
 from .models.loading import (
-    begin_with,
-    beside_the_cloth,
-    cloth_for,
-    drawn_models,
+    derive_priors,
+    draw_models,
+    list_causes_outside_cloth,
     load,
+    load_cloth_for,
     load_world,
-    predicted,
-    start_of,
-    uncertain,
+    make_start_builder,
+    predict_episode,
+    start_from_model,
     was_fitted,
 )
 from .models.model_file import load_model, read_model, save_model
 from .run import diagnose, write_diagnosis
-from .unknown.missing_force import MissingForce, missing_force
+from .unknown.missing_force import MissingForce, estimate_missing_force
 from .unknown.residual_force import ResidualForceFit, check_against_laws, learn_residual_force
 
 __all__ = [
+    "CRITERIA",
     "Confirmation",
+    "Criteria",
     "Diagnosis",
     "Fault",
-    "ModelFit",
     "Gain",
     "Hypothesis",
     "MissingForce",
-    "Model",
+    "ModelFit",
     "ResidualForceFit",
     "World",
-    "quadratic_warm_start",
-    "base_model",
-    "begin_with",
-    "beside_the_cloth",
-    "catalogue",
+    "WorldModel",
+    "build_base_model",
+    "check_against_laws",
     "check_episodes",
-    "cloth_for",
     "compare",
     "confirm",
     "correlate_scores",
+    "derive_priors",
     "diagnose",
-    "check_against_laws",
-    "drawn_models",
+    "draw_models",
     "estimate_force_drifts",
+    "estimate_missing_force",
+    "find_bifurcating_bins",
     "fit",
     "fit_noise",
-    "linearise",
     "judge",
-    "measure_lack_of_fit",
     "learn_residual_force",
+    "linearise",
+    "list_causes_outside_cloth",
+    "list_hypotheses",
     "load",
+    "load_cloth_for",
     "load_model",
     "load_world",
-    "missing_force",
-    "run_permutation_test",
+    "make_start_builder",
+    "measure_lack_of_fit",
+    "predict_episode",
     "predict_held_out",
-    "predicted",
-    "propose",
+    "prepare_data",
+    "propose_experiment",
+    "quadratic_warm_start",
     "read_episodes",
     "read_model",
     "refuse",
     "register",
     "register_file",
+    "run_permutation_test",
     "save_model",
     "screen",
     "search",
-    "prepare_data",
-    "start_of",
-    "uncertain",
-    "find_bifurcating_bins",
+    "start_from_model",
     "was_fitted",
     "write_diagnosis",
 ]

@@ -1,7 +1,7 @@
-"""Finished episodes on disk, so that a diagnosis that was stopped goes on where it was.
+"""Finished episodes on disk, so that a stopped diagnosis continues where it was.
 
-What an episode says at a point is a function of model, episode and question. A search is deterministic: run again, it
-asks the same questions in the same order, and finds the answers of before, bit by bit.
+The residuals of an episode at a point are a function of model, episode and question. A search is deterministic: run
+again, it asks the same questions in the same order, and finds the earlier answers, bit by bit.
 """
 
 from __future__ import annotations
@@ -12,37 +12,46 @@ from pathlib import Path
 from torch import Tensor
 
 from .._utils.resume import ResumableStore, digest
-from ..episodes.cloth_facts import cloth_fingerprint_parts
-from ..episodes.world import Model
-from .causes.user_hypotheses import digests
+from ..episodes.cloth_fingerprint import cloth_fingerprint_parts
+from ..episodes.world import WorldModel
+from .causes.user_hypotheses import digest_user_files
 from .data.binning import BinnedResiduals, EpisodeEvidence
-from .data.dataset import EpisodeCache, DiagnosisData
+from .data.dataset import DiagnosisData, EpisodeCache
 
-FIELDS = len(BinnedResiduals._fields)
+N_BIN_FIELDS = len(BinnedResiduals._fields)
 
 
-def kept_in(folder: Path, model: Model, setting: DiagnosisData, resume: bool | None) -> EpisodeCache:
-    """Answers in a folder, which is made when the first is known.
+def open_checkpoints(folder: Path, model: WorldModel, data: DiagnosisData, resume: bool | None) -> EpisodeCache:
+    """Open a folder of finished episodes, which is made when the first one is finished.
+
+    Args:
+        folder: the folder.
+        model: the base model.
+        data: the episodes.
+        resume: whether to continue; see ``diagnose``.
+
+    Returns:
+        A function of a question, a point and the work that answers it, which returns a stored answer if there is one.
 
     Raises:
-        InvalidInput: nothing to resume, or what another diagnosis left; a folder of other things.
+        InvalidInput: nothing to resume, what another diagnosis left, or a folder with other content.
     """
-    journal = ResumableStore(folder, _problem(model, setting), resume)
+    store = ResumableStore(folder, _describe_problem(model, data), resume)
 
-    def kept(question: Sequence[object], point: Tensor, work: Callable[[], EpisodeEvidence]) -> EpisodeEvidence:
-        def flat() -> tuple[Tensor, ...]:
-            found = work()
-            return (*found.bins, found.nuisance_stds, found.mesh_difference, found.is_simulated)
+    def answer(question: Sequence[object], point: Tensor, work: Callable[[], EpisodeEvidence]) -> EpisodeEvidence:
+        def compute() -> tuple[Tensor, ...]:
+            evidence = work()
+            return (*evidence.bins, evidence.nuisance_stds, evidence.mesh_difference, evidence.is_simulated)
 
-        answer = journal.get_or_compute(f"episode{question[0]}-{digest(question)}", point, flat)
-        return EpisodeEvidence(BinnedResiduals(*answer[:FIELDS]), *answer[FIELDS:])
+        columns = store.get_or_compute(f"episode{question[0]}-{digest(question)}", point, compute)
+        return EpisodeEvidence(BinnedResiduals(*columns[:N_BIN_FIELDS]), *columns[N_BIN_FIELDS:])
 
-    return kept
+    return answer
 
 
-def _problem(model: Model, setting: DiagnosisData) -> list[object]:
-    """All that an answer depends on beside the question."""
-    cloth = model.base.cloth
-    data = [part for e in setting.episodes for part in (*e.fingerprint_parts(), *model.base.identity(e))]
-    parts = [(p.name, p.step, p.std) for p in model.parameters]
-    return [setting.dt, parts, *digests(), *cloth_fingerprint_parts(cloth), setting.rest_positions, *data]
+def _describe_problem(model: WorldModel, data: DiagnosisData) -> list[object]:
+    """Return everything that an answer depends on besides the question."""
+    cloth = cloth_fingerprint_parts(model.base.cloth)
+    episodes = [part for e in data.episodes for part in (*e.fingerprint_parts(), *model.base.fingerprint_parts(e))]
+    parameters = [(p.name, p.step, p.prior_std) for p in model.parameters]
+    return [data.dt, parameters, *digest_user_files(), *cloth, data.rest_positions, *episodes]

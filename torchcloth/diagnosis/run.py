@@ -1,4 +1,4 @@
-"""``diagnose``: all stages in order."""
+"""``diagnose``: all stages of a diagnosis in order."""
 
 from __future__ import annotations
 
@@ -12,70 +12,73 @@ import torch
 from .._utils.files import to_json, write_text
 from .._utils.resume import digest, source_fingerprint
 from .._utils.torch_modes import isolated_grad_mode
-from ..episodes.cloth_facts import cloth_fingerprint_parts
-from ..episodes.world import Hypothesis, Model
+from ..episodes.cloth_fingerprint import cloth_fingerprint_parts
+from ..episodes.world import Hypothesis, WorldModel
 from ..errors import InvalidInput
 from ..recordings import Recording
-from ..recordings.consistency import listed, together
-from ..recordings.fingerprints import each_once, mark
-from .causes.hypotheses import catalogue, own_among
-from .causes.user_hypotheses import digests
-from .causes.user_hypothesis_checks import check_own
-from .checkpointing import kept_in
+from ..recordings.consistency import as_list, merge_scene
+from ..recordings.fingerprints import fingerprint, reject_duplicates
+from .causes.hypotheses import list_hypotheses, select_user_hypotheses
+from .causes.user_hypotheses import digest_user_files
+from .causes.user_hypothesis_checks import check_user_hypotheses
+from .checkpointing import open_checkpoints
 from .data.data_checks import check_episodes
-from .data.dataset import Progress, label_motions, prepare_data, check_positions_observed, prefix_progress
+from .data.dataset import Progress, check_positions_observed, label_motions, prefix_progress, prepare_data
 from .decide.search import SearchResult, search
 from .decide.verdict import Diagnosis, judge, refuse
 from .experiment.feasibility import write_episode
-from .experiment.proposal import propose
+from .experiment.proposal import propose_experiment
 from .inference.lack_of_fit import measure_lack_of_fit
-from .models.base_model import base_model
+from .models.base_model import build_base_model
 from .models.model_file import save_model
 from .report.cloud_overlays import make_overlays
-from .report.html_report import REPORT, write_report
-from .unknown.missing_force import missing_force
+from .report.html_report import REPORT_FILE, write_report
+from .unknown.missing_force import estimate_missing_force
 from .unknown.residual_force import check_against_laws, is_residual, learn_residual_force
 
-OPEN = ("ambiguous", "inconclusive", "unexplained")  # verdicts that another experiment may change
-NONE_TELLS = "no short motion that can be done would tell the causes from what they cannot be told from now"
-RESULT, BASE, EXTENDED = "diagnosis.json", "base.tcm", "extended.tcm"
-CONFIRMED = Path("confirmation") / "confirmation.json"  # where `torchcloth confirm` says what they gain
+OPEN_VERDICTS = ("ambiguous", "inconclusive", "unexplained")  # another experiment may change them
+NO_EXPERIMENT_WARNING = (
+    "no short motion that is possible would distinguish the causes from what they are confounded with"
+)
+RESULT_FILE, BASE_MODEL_FILE, EXTENDED_MODEL_FILE = "diagnosis.json", "base.tcm", "extended.tcm"
+CONFIRMATION_FILE = Path("confirmation") / "confirmation.json"  # written by `torchcloth confirm`
 
 
 @isolated_grad_mode()
 def diagnose(
     recordings: Sequence[Recording],
-    model: Model | None = None,
+    model: WorldModel | None = None,
     hypotheses: Sequence[Hypothesis] | None = None,
     progress: Progress = lambda _: None,
     journal: Path | None = None,
     resume: bool | None = False,
 ) -> Diagnosis:
-    """What a simulation of these episodes gets wrong, and what mending it gains.
+    """Find what a simulation of episodes gets wrong, and what correcting it gains.
 
     Args:
-        recordings: episodes of one cloth, at least two, of different motions (``split["motion"]``).
-        model: where to start; None: the base model of the first episode, in vacuum.
-        hypotheses: what to look for; None: the catalogue. With ``resume`` a name must mean what it did.
+        recordings: episodes of one cloth, at least two, with different motions (``split["motion"]``).
+        model: start of the search; None: the base model of the first episode, in vacuum.
+        hypotheses: what is asked about; None: the catalogue. With ``resume`` a name must mean what it meant before.
         progress: called with one line for each episode that is simulated.
-        journal: folder for finished episodes, a few hundred kilobytes each; None: nothing is kept.
-        resume: go on with what a diagnosis that was stopped left there; the answer is the same, bit by bit. None: start
-            over, but refuse to where it could go on.
+        journal: folder for finished episodes, a few hundred kilobytes each; None: nothing is stored.
+        resume: whether to continue with what a stopped diagnosis left there; the answer is the same bit by bit. None:
+            start over, but refuse a folder where it could continue.
 
     Raises:
         InvalidInput: fewer than two episodes, too few motions to hold one out, different cloths, one episode twice, a
             default dtype other than float64, a model with a residual force, or hypotheses that ``register`` would
             refuse.
-        RecordingError: an episode that lacks what is needed.
+        RecordingError: an episode without data that are needed.
         SimulationDiverged: the base model cannot be simulated.
     """
-    recordings = listed(recordings)
-    names = label_motions(recordings)
-    if len(set(names)) < 2:
-        each_once(recordings)  # a copy needs no other name
+    # 1. Checks of the input.
+    recordings = as_list(recordings)
+    motions = label_motions(recordings)
+    if len(set(motions)) < 2:
+        reject_duplicates(recordings)  # a copy does not need another name
         raise InvalidInput(
             "episodes",
-            got=f"{len(recordings)} with motion {', '.join(sorted(set(names))) or 'none'}",
+            got=f"{len(recordings)} with motion {', '.join(sorted(set(motions))) or 'none'}",
             expected="at least two motions: one is held out while the other is fitted",
             remedy="record another motion, or name them apart (split.motion in episode.json)",
         )
@@ -94,49 +97,66 @@ def diagnose(
             remedy="load_model(path, residual=False)",
         )
     if faults := check_episodes(recordings):
-        return refuse(faults, names)
-    each_once(recordings)
-    model = model or base_model(together(recordings))
-    asked = catalogue(model, recordings) if hypotheses is None else list(hypotheses)
-    own = own_among(asked)
-    plan = _plan(model, asked, names)
-    setting = prepare_data(model, recordings)
-    check_positions_observed(setting)
-    for place in (setting, setting.fine_mesh):  # each with a mesh of its own
-        if place is not None:
-            check_own(own, place.base, place.episodes)
+        return refuse(faults, motions)
+    reject_duplicates(recordings)
+
+    # 2. Model and hypotheses, and a fingerprint of everything that was decided before the first simulation.
+    model = model or build_base_model(merge_scene(recordings))
+    asked = list_hypotheses(model, recordings) if hypotheses is None else list(hypotheses)
+    user_hypotheses = select_user_hypotheses(asked)
+    plan_hash = _fingerprint_plan(model, asked, motions)
+
+    # 3. Data on both meshes.
+    data = prepare_data(model, recordings)
+    check_positions_observed(data)
+    for mesh_data in (data, data.fine_mesh):
+        if mesh_data is not None:
+            check_user_hypotheses(user_hypotheses, mesh_data.base, mesh_data.episodes)
     if journal is not None:
-        setting = replace(setting, kept=kept_in(journal, model, setting, resume))
-    many = torch.get_num_threads()
-    with _threads(1):  # simulations run side by side: threads for the small arrays of each would wait for each other
-        found = check_against_laws(search(model, setting, asked, progress), prefix_progress(progress, "laws without a cause"))
-        answer = _judged(found, many, progress)
+        data = replace(data, cache=open_checkpoints(journal, model, data, resume))
+
+    # 4. Search, doubt, unknowns, verdict, proposal. Simulations run in parallel, so torch's own threads would only
+    # wait.
+    threads = torch.get_num_threads()
+    with _torch_threads(1):
+        result = search(model, data, asked, progress)
+        result = check_against_laws(result, prefix_progress(progress, "laws without a cause"))
+        answer = _judge_with_unknowns(result, threads, progress)
         proposal = None
-        if answer.verdict in OPEN:
-            proposal = propose(found, answer.content, setting, prefix_progress(progress, "next experiment"))
-        over = make_overlays(answer.search, progress)
-    warnings = [*answer.content["warnings"], *([NONE_TELLS] if answer.verdict == "ambiguous" and not proposal else [])]
-    files = {"plan_hash": plan, "base": BASE, "model": EXTENDED, "episodes": [mark(r) for r in recordings]}
-    following, episode = proposal or (None, None)
-    said = answer.content | files | {"next_experiment": following, "warnings": warnings}
-    return replace(answer, content=said, overlays=over, experiment=episode)
+        if answer.verdict in OPEN_VERDICTS:
+            stage = prefix_progress(progress, "next experiment")
+            proposal = propose_experiment(result, answer.content, data, stage)
+        overlays = make_overlays(answer.search, progress)
+    has_no_experiment = answer.verdict == "ambiguous" and not proposal
+    description, episode = proposal or (None, None)
+    content = {
+        **answer.content,
+        "plan_hash": plan_hash,
+        "base": BASE_MODEL_FILE,
+        "model": EXTENDED_MODEL_FILE,
+        "episodes": [fingerprint(r) for r in recordings],
+        "next_experiment": description,
+        "warnings": [*answer.content["warnings"], *([NO_EXPERIMENT_WARNING] if has_no_experiment else [])],
+    }
+    return replace(answer, content=content, overlays=overlays, experiment=episode)
 
 
-def _plan(model: Model, asked: Sequence[Hypothesis], names: Sequence[str]) -> str:
-    """A fingerprint of what was decided before anything was simulated.
+def _fingerprint_plan(model: WorldModel, asked: Sequence[Hypothesis], motions: Sequence[str]) -> str:
+    """Return a fingerprint of everything that was decided before the first simulation.
 
-    The sources hold all thresholds; beside them the base model's cloth and numbers with their priors, the causes that
-    it comes with, what is asked about and from what size it matters, whose causes those are, and which episodes are
-    held out together.
+    The sources contain all thresholds. The rest is the base model's cloth, its parameters with their priors, the causes
+    that it comes with, the hypotheses with their smallest effects of interest, the files of user hypotheses, and which
+    episodes are held out together.
     """
-    numbers = [(p.name, p.unit, p.std, p.step, p.low, p.high) for p in model.parameters]
-    causes = [[(h.name, h.unit, *h.sizes) for h in hypotheses] for hypotheses in (model.accepted, asked)]
-    return digest([source_fingerprint(), *digests(), *cloth_fingerprint_parts(model.base.cloth), numbers, model.point, *causes, list(names)])
+    parameters = [(p.name, p.unit, p.prior_std, p.step, p.min_coordinate, p.max_coordinate) for p in model.parameters]
+    causes = [[(h.name, h.unit, *h.amplitude_settings) for h in hypotheses] for hypotheses in (model.accepted, asked)]
+    cloth = cloth_fingerprint_parts(model.base.cloth)
+    code = [source_fingerprint(), *digest_user_files()]
+    return digest([*code, *cloth, parameters, model.point, *causes, list(motions)])
 
 
 @contextmanager
-def _threads(count: int) -> Iterator[None]:
-    """So many of torch's."""
+def _torch_threads(count: int) -> Iterator[None]:
     before = torch.get_num_threads()
     torch.set_num_threads(count)
     try:
@@ -145,41 +165,49 @@ def _threads(count: int) -> Iterator[None]:
         torch.set_num_threads(before)
 
 
-def _judged(found: SearchResult, threads: int, progress: Progress) -> Diagnosis:
-    """With what can be said of what no known cause explains."""
-    left = measure_lack_of_fit(found.end, found.data.motions)
-    lacking, stable = any(row.is_significant for row in left), all(row.meshes_agree for row in left)
-    missing = None
-    if lacking:
-        with _threads(threads):  # an episode at a time, whose directions the threads share
-            missing = missing_force(found.end, found.data, progress=progress)
-    # laws tell of more than what is left: they know what it would look like
-    learned = lacking or (stable and not found.causes)
-    residual = learn_residual_force(found.end, found.data, progress) if learned else None
-    return judge(found, found.data.motions, missing, residual)
+def _judge_with_unknowns(result: SearchResult, threads: int, progress: Progress) -> Diagnosis:
+    """Derive the verdict, with the missing force and the residual force where no known cause suffices."""
+    rows = measure_lack_of_fit(result.end, result.data.motions)
+    is_inadequate, meshes_agree = any(row.is_significant for row in rows), all(row.meshes_agree for row in rows)
+    missing_force = None
+    if is_inadequate:
+        with _torch_threads(threads):  # one episode at a time, whose directions share the threads
+            missing_force = estimate_missing_force(result.end, result.data, progress=progress)
+    # laws find more than the lack of fit, because they know what it would look like
+    needs_laws = is_inadequate or (meshes_agree and not result.causes)
+    residual_force = learn_residual_force(result.end, result.data, progress) if needs_laws else None
+    return judge(result, result.data.motions, missing_force, residual_force)
 
 
 def write_diagnosis(answer: Diagnosis, recordings: Sequence[Recording], folder: Path) -> Diagnosis:
-    """Write diagnosis.json, report.html and, unless data are invalid, the models; returns the answer as written.
+    """Write diagnosis.json, report.html and, unless data are invalid, the models.
 
-    An experiment that is proposed becomes an episode beside them, ``next_experiment``, of which nothing is seen yet; a
-    warning says where it could not.
-    ``recordings`` are the episodes, which say what the base model is of.
+    A proposed experiment is written as an episode beside them, ``next_experiment``, without measurements. If it cannot
+    be written, a warning says so.
+
+    Args:
+        answer: the diagnosis.
+        recordings: the episodes, which describe the base model's cloth.
+        folder: made if it does not exist.
+
+    Returns:
+        The diagnosis as written.
     """
     folder.mkdir(parents=True, exist_ok=True)
-    for name in (RESULT, REPORT, CONFIRMED):  # of an earlier diagnosis: they say nothing of other models
+    for name in (RESULT_FILE, REPORT_FILE, CONFIRMATION_FILE):  # those of an earlier diagnosis are about other models
         (folder / name).unlink(missing_ok=True)
     if answer.optional_search is None:
-        for name in (BASE, EXTENDED):
+        for name in (BASE_MODEL_FILE, EXTENDED_MODEL_FILE):
             (folder / name).unlink(missing_ok=True)
     else:
-        said, scene = [*answer.search.start.model.met, *answer.content["episodes"]], together(recordings)
-        residual = answer.residual_force.model if answer.residual_force is not None and answer.residual_force.terms else None
-        start, end = answer.search.start, answer.search.end
-        save_model(folder / BASE, start.model, scene, start.covariance, episodes=said)
-        save_model(folder / EXTENDED, end.model, scene, end.covariance, residual, said)
+        start, end, scene = answer.search.start, answer.search.end, merge_scene(recordings)
+        fingerprints = [*start.model.episode_fingerprints, *answer.content["episodes"]]
+        laws = answer.residual_force
+        residual = laws.model if laws is not None and laws.terms else None
+        save_model(folder / BASE_MODEL_FILE, start.model, scene, start.covariance, episodes=fingerprints)
+        save_model(folder / EXTENDED_MODEL_FILE, end.model, scene, end.covariance, residual, fingerprints)
     if warning := write_episode(answer.experiment, folder):
         answer = replace(answer, content=answer.content | {"warnings": [*answer.content["warnings"], warning]})
-    write_text(folder / RESULT, to_json(answer.content))
+    write_text(folder / RESULT_FILE, to_json(answer.content))
     write_report(answer, folder)
     return answer

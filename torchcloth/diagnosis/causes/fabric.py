@@ -1,4 +1,4 @@
-"""What the fabric may be beyond an isotropic sheet of its stated size and mass."""
+"""Causes in the fabric: what it may be beyond an isotropic sheet of its stated size and mass."""
 
 from __future__ import annotations
 
@@ -7,22 +7,29 @@ from ...episodes.world import Hypothesis, World
 from ...errors import InvalidInput
 from ...materials import OrthotropicAEP, StiffeningAEP
 
-MOST = 0.9  # share by which one stiffness may fall short of another
-YIELD = 30.0  # 1/m, beyond which bent cloth keeps a crease
+MAX_STIFFNESS_DEFICIT = 0.9  # fraction by which one stiffness may be smaller than another
+CREASE_YIELD_CURVATURE_PER_M = 30.0  # bent cloth keeps a crease beyond this curvature
 
 
-def moduli(world: World, weft: float = 0.0, shear: float = 0.0, stiffening: float = 0.0) -> World:
-    """Shares by which the weft falls short of the warp, and shear exceeds the isotropic value; c of stiffening."""
-    own = world.cloth.material
-    nu, warp = float(own.poisson_ratio.value), float(own.youngs_modulus.value)  # type: ignore[union-attr,arg-type]
-    if isinstance(own, OrthotropicAEP):
-        e2, g = float(own.weft_modulus.value), float(own.shear_modulus.value)
-        c = float(own.warp_stiffening.value)
+def change_moduli(world: World, weft: float = 0.0, shear: float = 0.0, stiffening: float = 0.0) -> World:
+    """Return a world whose moduli in tension are changed.
+
+    Args:
+        world: the world to change.
+        weft: fraction by which the weft modulus is smaller than now.
+        shear: fraction by which the shear modulus is larger than now.
+        stiffening: increase of the stiffening coefficient c.
+    """
+    material = world.cloth.material
+    nu, warp = float(material.poisson_ratio.value), float(material.youngs_modulus.value)  # type: ignore[union-attr,arg-type]
+    if isinstance(material, OrthotropicAEP):
+        e2, g = float(material.weft_modulus.value), float(material.shear_modulus.value)
+        c = float(material.warp_stiffening.value)
     else:
         e2, g = warp, warp / (2 * (1 + nu))
-        c = float(own.stiffening.value) if isinstance(own, StiffeningAEP) else 0.0
-        if not (weft or shear):  # one modulus, to be fitted on
-            return world.with_cloth(material=StiffeningAEP(warp, nu, c + stiffening, thickness=own.thickness))  # type: ignore[union-attr,arg-type]
+        c = float(material.stiffening.value) if isinstance(material, StiffeningAEP) else 0.0
+        if not (weft or shear):  # one modulus, which stays a parameter of fits
+            return world.with_cloth(material=StiffeningAEP(warp, nu, c + stiffening, thickness=material.thickness))  # type: ignore[union-attr,arg-type]
     e2, g, c = e2 * (1 - weft), g * (1 + shear), c + stiffening
     new = OrthotropicAEP(
         warp,
@@ -31,44 +38,50 @@ def moduli(world: World, weft: float = 0.0, shear: float = 0.0, stiffening: floa
         nu,
         warp_stiffening=c,
         weft_stiffening=c,
-        thickness=own.thickness,  # type: ignore[union-attr,arg-type]
+        thickness=material.thickness,  # type: ignore[union-attr,arg-type]
     )
     return world.with_cloth(material=new)
 
 
-def _bending(world: World, **changes: float) -> World:
-    """Further damping [s], curl [1/m], mobility of creases [1/s]; weft stiffness as a share beyond the warp's."""
-    own: Bending = world.cloth.effects["bending"]  # type: ignore[assignment]
-    number = lambda name: 0.0 if (part := getattr(own, name, None)) is None else float(part.value)  # noqa: E731
+def _change_bending(world: World, **changes: float) -> World:
+    """Add damping [s], curl [1/m], mobility of creases [1/s] and a fraction of weft stiffness."""
+    bending: Bending = world.cloth.effects["bending"]  # type: ignore[assignment]
+
+    def number(name: str) -> float:
+        return 0.0 if (parameter := getattr(bending, name, None)) is None else float(parameter.value)
+
     names = ("damping_time", "curl_warp", "curl_weft", "mobility")
-    options = {name: number(name) + changes.get(name, 0.0) for name in names}
-    kept = {name: value for name, value in options.items() if value}
+    sums = {name: number(name) + changes.get(name, 0.0) for name in names}
+    options = {name: value for name, value in sums.items() if value}
     ratio = (number("weft_ratio") or 1.0) * (1 + changes.get("weft", 0.0))
     if ratio != 1.0:
-        kept |= {"weft_ratio": ratio, "twist_ratio": ratio**0.5}
-    if "mobility" in kept:
-        kept["yield_curvature"] = YIELD
-    kind = CreasingBending if "mobility" in kept else Bending
-    new = kind(number("stiffness"), poisson=own.poisson, **kept)  # type: ignore[arg-type]
+        options |= {"weft_ratio": ratio, "twist_ratio": ratio**0.5}
+    if "mobility" in options:
+        options["yield_curvature"] = CREASE_YIELD_CURVATURE_PER_M
+    kind = CreasingBending if "mobility" in options else Bending
+    new = kind(number("stiffness"), poisson=bending.poisson, **options)  # type: ignore[arg-type]
     return world.with_cloth({"bending": new})
 
 
-def _rest(world: World, name: str, amount: float) -> World:
+def _change_rest_shape(world: World, name: str, amount: float) -> World:
     effects = dict(world.cloth.effects.items())
-    own: RestShape | None = effects.get("rest_shape")  # type: ignore[assignment]
-    values = {n: 0.0 if own is None else float(getattr(own, n).value) for n in ("shrink_warp", "shrink_weft", "skew")}
+    rest_shape: RestShape | None = effects.get("rest_shape")  # type: ignore[assignment]
+    values = {
+        n: 0.0 if rest_shape is None else float(getattr(rest_shape, n).value)
+        for n in ("shrink_warp", "shrink_weft", "skew")
+    }
     values[name] += amount
     return world.with_cloth({"rest_shape": RestShape(**values)})
 
 
-def _density(world: World, share: float) -> World:
+def _change_density(world: World, fraction: float) -> World:
     new = world.with_cloth()
-    new.cloth.areal_density.set(new.cloth.areal_density.value.item() * (1 + share))
+    new.cloth.areal_density.set(new.cloth.areal_density.value.item() * (1 + fraction))
     return new
 
 
-def _seam(world: World, mass: float) -> World:
-    """Along v, at half the width of the pattern, whatever the mesh: vertices may lie to either side."""
+def _add_seam(world: World, mass: float) -> World:
+    """Add a seam along v at half the width of the pattern; it need not pass through vertices."""
     pattern = world.cloth.mesh.pattern
     if pattern is None:
         raise InvalidInput("mesh", got="no pattern coordinates", expected="a pattern: the seam is along its v")
@@ -77,31 +90,49 @@ def _seam(world: World, mass: float) -> World:
     return world.with_cloth({"seam": LineMass(mass, path=[[middle, low[1]], [middle, high[1]]])})
 
 
-def _tilt(axis: int, world: World, angle: float) -> World:
-    """Gravity leans towards +x (0) or +y (1)."""
-    own: Gravity = world.cloth.effects["gravity"]  # type: ignore[assignment]
-    tilt = own.tilt.tolist()
-    tilt[1 - axis] += angle if axis == 1 else -angle  # about the other axis, by the right hand, with g along -z
-    return world.with_cloth({"gravity": Gravity(own.acceleration.tolist(), tilt)})
+def _tilt_gravity(axis: int, world: World, angle: float) -> World:
+    """Tilt gravity towards +x (0) or +y (1)."""
+    gravity: Gravity = world.cloth.effects["gravity"]  # type: ignore[assignment]
+    tilt = gravity.tilt.tolist()
+    tilt[1 - axis] += angle if axis == 1 else -angle  # right-handed about the other axis, with g along -z
+    return world.with_cloth({"gravity": Gravity(gravity.acceleration.tolist(), tilt)})
 
 
-OF_BENDING = ("damp.bend", "plast.crease", "bend.aniso", "rest.curl")  # effects that change a cloth's bending
-OF_MEMBRANE = ("elas.ortho", "elas.shear", "damp.kv", "fric.internal_shear")  # and its stretching
+BENDING_EFFECTS = ("damp.bend", "plast.crease", "bend.aniso", "rest.curl")  # change a cloth's bending
+MEMBRANE_EFFECTS = ("elas.ortho", "elas.shear", "damp.kv", "fric.internal_shear")  # change its stretching
 HYPOTHESES = (
-    Hypothesis("damp.bend", "s", 0.05, lambda w, a: _bending(w, damping_time=a)),
-    Hypothesis("plast.crease", "1/s", 5.0, lambda w, a: _bending(w, mobility=a), needs_fine_mesh=True),
-    Hypothesis("bend.aniso", "-", -0.6, lambda w, a: _bending(w, weft=a), signed=True, low=-MOST),
-    Hypothesis("elas.ortho", "-", 0.5, lambda w, a: moduli(w, weft=a), signed=True, high=MOST),
-    Hypothesis("elas.shear", "-", -0.6, lambda w, a: moduli(w, shear=a), signed=True, low=-MOST),
-    Hypothesis("elas.stiffen", "-", 10.0, lambda w, a: moduli(w, stiffening=a), equivalent_parameter="stiffening"),
-    Hypothesis("rest.curl[warp]", "1/m", 3.0, lambda w, a: _bending(w, curl_warp=a), signed=True),
-    Hypothesis("rest.curl[weft]", "1/m", 3.0, lambda w, a: _bending(w, curl_weft=a), signed=True),
-    Hypothesis("rest.shrink[warp]", "-", 0.03, lambda w, a: _rest(w, "shrink_warp", a), signed=True),
-    Hypothesis("rest.shrink[weft]", "-", 0.03, lambda w, a: _rest(w, "shrink_weft", a), signed=True),
-    Hypothesis("rest.skew", "rad", 0.03, lambda w, a: _rest(w, "skew", a), signed=True),
-    Hypothesis("mass.density", "-", 0.08, _density, signed=True, equivalent_parameter="areal_density"),
+    Hypothesis("damp.bend", "s", 0.05, lambda w, a: _change_bending(w, damping_time=a)),
+    Hypothesis("plast.crease", "1/s", 5.0, lambda w, a: _change_bending(w, mobility=a), needs_fine_mesh=True),
+    Hypothesis(
+        "bend.aniso",
+        "-",
+        -0.6,
+        lambda w, a: _change_bending(w, weft=a),
+        signed=True,
+        min_amplitude=-MAX_STIFFNESS_DEFICIT,
+    ),
+    Hypothesis(
+        "elas.ortho", "-", 0.5, lambda w, a: change_moduli(w, weft=a), signed=True, max_amplitude=MAX_STIFFNESS_DEFICIT
+    ),
+    Hypothesis(
+        "elas.shear",
+        "-",
+        -0.6,
+        lambda w, a: change_moduli(w, shear=a),
+        signed=True,
+        min_amplitude=-MAX_STIFFNESS_DEFICIT,
+    ),
+    Hypothesis(
+        "elas.stiffen", "-", 10.0, lambda w, a: change_moduli(w, stiffening=a), equivalent_parameter="stiffening"
+    ),
+    Hypothesis("rest.curl[warp]", "1/m", 3.0, lambda w, a: _change_bending(w, curl_warp=a), signed=True),
+    Hypothesis("rest.curl[weft]", "1/m", 3.0, lambda w, a: _change_bending(w, curl_weft=a), signed=True),
+    Hypothesis("rest.shrink[warp]", "-", 0.03, lambda w, a: _change_rest_shape(w, "shrink_warp", a), signed=True),
+    Hypothesis("rest.shrink[weft]", "-", 0.03, lambda w, a: _change_rest_shape(w, "shrink_weft", a), signed=True),
+    Hypothesis("rest.skew", "rad", 0.03, lambda w, a: _change_rest_shape(w, "skew", a), signed=True),
+    Hypothesis("mass.density", "-", 0.08, _change_density, signed=True, equivalent_parameter="areal_density"),
     Hypothesis("mass.hem", "kg/m", 0.02, lambda w, a: w.with_cloth({"hem": LineMass(a)})),
-    Hypothesis("mass.seam", "kg/m", 0.02, _seam),
-    Hypothesis("env.gravity_tilt[x]", "rad", 0.01, lambda w, a: _tilt(0, w, a), signed=True),
-    Hypothesis("env.gravity_tilt[y]", "rad", 0.01, lambda w, a: _tilt(1, w, a), signed=True),
+    Hypothesis("mass.seam", "kg/m", 0.02, _add_seam),
+    Hypothesis("env.gravity_tilt[x]", "rad", 0.01, lambda w, a: _tilt_gravity(0, w, a), signed=True),
+    Hypothesis("env.gravity_tilt[y]", "rad", 0.01, lambda w, a: _tilt_gravity(1, w, a), signed=True),
 )

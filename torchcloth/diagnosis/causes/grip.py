@@ -1,6 +1,8 @@
-"""What the robot and its grippers may do other than they say."""
+"""Causes in the robot, its grippers and the table."""
 
 from __future__ import annotations
+
+from collections.abc import Callable
 
 import torch
 
@@ -11,22 +13,24 @@ from ...episodes.world import Hypothesis, World
 from ...recordings import Recording
 from ..data.grip_patch_mesh import move_grip_patches
 
-LEAST = 1e-3  # -, of friction
-HOLD = 0.3  # N, above which a loose grip yields
-SLOW = 0.01  # m/s, of slip at which the excess of friction has fallen to 1 / e
-REACH = 1e-3  # m, of a sticky table's pull
-STEEP = 0.99  # cosine, of a normal that is the world's x
+MIN_FRICTION = 1e-3
+SLIP_THRESHOLD_N = 0.3  # a loose grip yields to larger forces
+STRIBECK_SPEED_M_PER_S = 0.01  # static friction has fallen to 1 / e of its excess at this speed
+ADHESION_RANGE_M = 1e-3  # of a table's attraction
+MAX_NORMAL_COSINE = 0.99  # of a plane's normal with the world's x; a larger one is x itself
 
 
-def _grasps(world: World) -> dict[str, Grasp]:
+def _list_grasps(world: World) -> dict[str, Grasp]:
     return {name: part for name, part in world.cloth.boundaries.items() if isinstance(part, Grasp)}
 
 
-def _slip(world: World, mobility: float) -> World:
-    return world.with_cloth({f"slip_{name}": GripSlip(name, mobility, HOLD) for name in _grasps(world)})
+def _add_slip(world: World, mobility: float) -> World:
+    return world.with_cloth(
+        {f"slip_{name}": GripSlip(name, mobility, SLIP_THRESHOLD_N) for name in _list_grasps(world)}
+    )
 
 
-def _planes(world: World, change) -> World:
+def _change_planes(world: World, change: Callable[[Plane], Plane]) -> World:
     parts = {}
     for name, part in world.cloth.boundaries.items():
         if isinstance(part, Plane):
@@ -34,45 +38,52 @@ def _planes(world: World, change) -> World:
     return world.with_cloth(boundaries=parts) if parts else world
 
 
-def _friction(world: World, more: float = 0.0, along: float = 0.0, excess: float = 0.0) -> World:
-    """By so much (across, times the ratio that the table has); along one axis by a share; before it slips by an excess.
+def _change_friction(world: World, more: float = 0.0, along: float = 0.0, excess: float = 0.0) -> World:
+    """Add friction, a fraction along one axis, and an excess before the cloth slips.
 
     No law has both a direction and an excess: with the one, the other changes nothing.
     """
 
-    def changed(plane: Plane) -> Plane:
+    def change(plane: Plane) -> Plane:
         law: Coulomb = plane.friction  # type: ignore[assignment]
-        mu = max(law.value.item() + more, LEAST)
+        mu = max(law.value.item() + more, MIN_FRICTION)
         ratio = law.ratio.value.item() if isinstance(law, Elliptic) else 1.0
-        sticky = excess + (law.excess.value.item() if isinstance(law, Stribeck) else 0.0)
-        if (along or ratio != 1.0) and sticky:
+        static_excess = excess + (law.excess.value.item() if isinstance(law, Stribeck) else 0.0)
+        if (along or ratio != 1.0) and static_excess:
             return plane
-        new = Elliptic(mu * (1 + along), mu * ratio, _axis(plane)) if along or ratio != 1.0 else mu
-        return Plane(plane.point.tolist(), plane.normal.tolist(), Stribeck(mu, mu + sticky, SLOW) if sticky else new)
+        if static_excess:
+            new: Coulomb | float = Stribeck(mu, mu + static_excess, STRIBECK_SPEED_M_PER_S)
+        elif along or ratio != 1.0:
+            new = Elliptic(mu * (1 + along), mu * ratio, _friction_axis(plane))
+        else:
+            new = mu
+        return Plane(plane.point.tolist(), plane.normal.tolist(), new)
 
-    return _planes(world, changed)
+    return _change_planes(world, change)
 
 
-def least_change(cloth: Cloth) -> float:
-    """Of friction, at which the least of the planes' is none."""
-    every = [part.friction.value.item() for part in cloth.boundaries.values() if isinstance(part, Plane)]
-    return LEAST - min(every, default=0.0)
+def compute_min_friction_change(cloth: Cloth) -> float:
+    """Return the change of friction at which the smallest friction of a plane is as small as possible."""
+    frictions = [part.friction.value.item() for part in cloth.boundaries.values() if isinstance(part, Plane)]
+    return MIN_FRICTION - min(frictions, default=0.0)
 
 
-def _axis(plane: Plane) -> list[float]:
-    """Of a direction-dependent friction that is there, else the world's x within the plane; of walls along x its y."""
+def _friction_axis(plane: Plane) -> list[float]:
+    """Return the axis of an elliptic friction, else the world's x within the plane; its y for walls normal to x."""
     if isinstance(plane.friction, Elliptic):
         return plane.friction.axis.tolist()
     normal = plane.normal.double()
     x, y, _ = torch.eye(3, dtype=torch.float64)
-    aside = x if abs(float(normal[0])) < STEEP else y
+    aside = x if abs(float(normal[0])) < MAX_NORMAL_COSINE else y
     return (aside - (aside @ normal) * normal).tolist()
 
 
-def _sticky(world: World, stress: float) -> World:
-    """Every table pulls."""
+def _add_adhesion(world: World, stress: float) -> World:
     tables = {name: part for name, part in world.cloth.boundaries.items() if isinstance(part, Plane)}
-    pulls = {f"{name}_pull": Adhesion(stress, REACH, t.point.tolist(), t.normal.tolist()) for name, t in tables.items()}
+    pulls = {
+        f"{name}_pull": Adhesion(stress, ADHESION_RANGE_M, t.point.tolist(), t.normal.tolist())
+        for name, t in tables.items()
+    }
     return world.with_cloth(pulls)
 
 
@@ -81,11 +92,27 @@ def _has_table(recording: Recording) -> bool:
 
 
 HYPOTHESES = (
-    Hypothesis("grip.slip", "m/(N s)", 0.05, _slip),
-    Hypothesis("grip.width", "m", 0.02, lambda w, a: move_grip_patches(w, wider=a), high=0.05),
-    Hypothesis("robot.regrasp", "m", 0.017, lambda w, a: move_grip_patches(w, along=a), signed=True, low=-0.04, high=0.04),
-    Hypothesis("contact.mu", "-", 0.2, lambda w, a: _friction(w, more=a), signed=True, needs=_has_table),
-    Hypothesis("contact.aniso", "-", -0.5, lambda w, a: _friction(w, along=a), signed=True, needs=_has_table, low=-0.9),
-    Hypothesis("contact.stick", "-", 0.3, lambda w, a: _friction(w, excess=a), needs=_has_table),
-    Hypothesis("contact.adhesion", "Pa", 1.5, _sticky, needs=_has_table),
+    Hypothesis("grip.slip", "m/(N s)", 0.05, _add_slip),
+    Hypothesis("grip.width", "m", 0.02, lambda w, a: move_grip_patches(w, wider=a), max_amplitude=0.05),
+    Hypothesis(
+        "robot.regrasp",
+        "m",
+        0.017,
+        lambda w, a: move_grip_patches(w, along=a),
+        signed=True,
+        min_amplitude=-0.04,
+        max_amplitude=0.04,
+    ),
+    Hypothesis("contact.mu", "-", 0.2, lambda w, a: _change_friction(w, more=a), signed=True, is_applicable=_has_table),
+    Hypothesis(
+        "contact.aniso",
+        "-",
+        -0.5,
+        lambda w, a: _change_friction(w, along=a),
+        signed=True,
+        is_applicable=_has_table,
+        min_amplitude=-0.9,
+    ),
+    Hypothesis("contact.stick", "-", 0.3, lambda w, a: _change_friction(w, excess=a), is_applicable=_has_table),
+    Hypothesis("contact.adhesion", "Pa", 1.5, _add_adhesion, is_applicable=_has_table),
 )

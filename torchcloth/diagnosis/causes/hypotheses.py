@@ -1,7 +1,7 @@
-"""The known causes, each as one number that changes a world. Amplitude 0 is the world as it is.
+"""Catalogue of causes, each one number that changes a world. Amplitude 0 leaves the world as it is.
 
 Typical amplitudes are published magnitudes (KES for friction, flat plates for air, laundering standards for shrinkage).
-What a user registers joins the search.
+Hypotheses that a user registers join the search.
 """
 
 from __future__ import annotations
@@ -11,33 +11,32 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 
-from ...episodes.world import RESIDUAL, Hypothesis, Model
+from ...episodes.world import RESIDUAL_EFFECT_PREFIX, Hypothesis, WorldModel
 from ...errors import InvalidInput
-from ...pose.objective import CORRECTION
+from ...pose.objective import CORRECTION_EFFECT_NAME
 from ...recordings import Recording
 from . import air, fabric, grip, observer
-from .user_hypothesis_checks import blamed
+from .user_hypothesis_checks import explaining_user_errors
 
-TAKEN = frozenset(
-    {air.DRAG, "linear", "added_mass", "viscosity", "hem", "seam", "rest_shape", "gravity", "bending"}
-    | {"bending_friction", "shear_friction", RESIDUAL, CORRECTION}
+RESERVED_EFFECT_NAMES = frozenset(
+    {air.DRAG_EFFECT_NAME, "linear", "added_mass", "viscosity", "hem", "seam", "rest_shape", "gravity", "bending"}
+    | {"bending_friction", "shear_friction", RESIDUAL_EFFECT_PREFIX, CORRECTION_EFFECT_NAME}
 )
-BEGIN, END = "slip_", "_pull"  # of names with a gripper's or a table's
+RESERVED_PREFIX, RESERVED_SUFFIX = "slip_", "_pull"  # of effects named after a gripper or a table
 _registered: list[Hypothesis] = []
-_notes: list[list[Hypothesis]] = []
+_recorders: list[list[Hypothesis]] = []
 
 
 def register(hypothesis: Hypothesis) -> Hypothesis:
-    """Let a hypothesis of one's own join every search; one of the same name that was registered before is replaced.
+    """Register a hypothesis, which joins every search; one of the same name that was registered before is replaced.
 
     Raises:
-        InvalidInput: a name of the catalogue or of a residual force's law, or a typical amplitude or share that it
-            cannot have.
+        InvalidInput: a name of the catalogue or of a residual force's law, or invalid fields.
     """
-    _check_size(hypothesis)
-    forget(hypothesis.name)
-    taken = "which the catalogue has" if hypothesis.name in {h.name for h in known()} else ""
-    if hypothesis.name.startswith(f"{RESIDUAL}."):
+    _check_fields(hypothesis)
+    unregister(hypothesis.name)
+    taken = "which the catalogue has" if hypothesis.name in {h.name for h in list_known_hypotheses()} else ""
+    if hypothesis.name.startswith(f"{RESIDUAL_EFFECT_PREFIX}."):
         taken = "as laws of a residual force are called"
     if taken:
         raise InvalidInput(
@@ -46,100 +45,127 @@ def register(hypothesis: Hypothesis) -> Hypothesis:
             expected="a name of its own",
             remedy=f"call it e.g. 'my.{hypothesis.name.partition('.')[2]}'",
         )
-    for joined in (_registered, *_notes):
+    for joined in (_registered, *_recorders):
         joined.append(hypothesis)
     return hypothesis
 
 
-def _check_size(hypothesis: Hypothesis) -> None:
+def _check_fields(hypothesis: Hypothesis) -> None:
     for key in ("name", "unit"):
-        if not isinstance(said := getattr(hypothesis, key), str) or not said:
-            raise InvalidInput(f"{key} of a hypothesis", got=repr(said), expected="a word")
+        if not isinstance(text := getattr(hypothesis, key), str) or not text:
+            raise InvalidInput(f"{key} of a hypothesis", got=repr(text), expected="a word")
     if not isinstance(hypothesis.description, str):
-        raise InvalidInput(f"says of {hypothesis.name!r}", got=repr(hypothesis.description), expected="a sentence")
-    for key in ("typical", "share", "step", "low", "high"):
+        raise InvalidInput(
+            f"description of {hypothesis.name!r}", got=repr(hypothesis.description), expected="a sentence"
+        )
+    for key in ("typical", "smallest_fraction", "step_fraction", "min_amplitude", "max_amplitude"):
         if not isinstance(number := getattr(hypothesis, key), (int, float)):
             raise InvalidInput(f"{key} of {hypothesis.name!r}", got=repr(number), expected="a number")
-    if not isinstance(kin := hypothesis.structurally_equivalent, tuple | list) or not all(isinstance(name, str) for name in kin):
-        raise InvalidInput(f"kin of {hypothesis.name!r}", got=repr(kin), expected='a tuple of names, ("obs.clock",)')
+    names = hypothesis.structurally_equivalent
+    if not isinstance(names, tuple | list) or not all(isinstance(name, str) for name in names):
+        raise InvalidInput(
+            f"structurally_equivalent of {hypothesis.name!r}",
+            got=repr(names),
+            expected='a tuple of names, ("obs.clock",)',
+        )
     if not callable(hypothesis.apply):
         raise InvalidInput(f"apply of {hypothesis.name!r}", got=repr(hypothesis.apply), expected="a function")
-    wrong = hypothesis.typical == 0 or (hypothesis.typical < 0 and not hypothesis.signed)
-    if wrong or not math.isfinite(hypothesis.typical):
+    has_wrong_sign = hypothesis.typical == 0 or (hypothesis.typical < 0 and not hypothesis.signed)
+    if has_wrong_sign or not math.isfinite(hypothesis.typical):
         expected = "another than 0" if hypothesis.signed else "a value > 0, or signed=True and one below"
         raise InvalidInput(f"typical of {hypothesis.name!r}", got=hypothesis.typical, expected=expected)
     if not 0 < hypothesis.smallest_fraction < math.inf:
-        raise InvalidInput(f"share of {hypothesis.name!r}", got=hypothesis.smallest_fraction, expected="a value > 0, e.g. 0.4")
-    if not 0 < hypothesis.step < math.inf:
-        raise InvalidInput(f"step of {hypothesis.name!r}", got=hypothesis.step, expected="a value > 0, e.g. 0.1")
-    ends = hypothesis.low, hypothesis.high
+        raise InvalidInput(
+            f"smallest_fraction of {hypothesis.name!r}",
+            got=hypothesis.smallest_fraction,
+            expected="a value > 0, e.g. 0.4",
+        )
+    if not 0 < hypothesis.step_fraction < math.inf:
+        raise InvalidInput(
+            f"step_fraction of {hypothesis.name!r}", got=hypothesis.step_fraction, expected="a value > 0, e.g. 0.1"
+        )
+    ends = hypothesis.min_amplitude, hypothesis.max_amplitude
     if not ends[0] <= min(0.0, hypothesis.typical) <= max(0.0, hypothesis.typical) <= ends[1]:
         expected = f"ends about 0 and the typical {hypothesis.typical:g}"
         raise InvalidInput(
-            f"low and high of {hypothesis.name!r}", got=f"{ends[0]:g} and {ends[1]:g}", expected=expected
+            f"min_amplitude and max_amplitude of {hypothesis.name!r}",
+            got=f"{ends[0]:g} and {ends[1]:g}",
+            expected=expected,
         )
 
 
-def forget(name: str) -> None:
-    """Take a registered hypothesis out again."""
+def unregister(name: str) -> None:
+    """Remove a registered hypothesis."""
     _registered[:] = [h for h in _registered if h.name != name]
 
 
 @contextmanager
-def noted() -> Iterator[list[Hypothesis]]:
-    """What is registered meanwhile, anew or again."""
-    _notes.append([])
+def record_registrations() -> Iterator[list[Hypothesis]]:
+    """Yield a list of the hypotheses that are registered inside the block."""
+    _recorders.append([])
     try:
-        yield _notes[-1]
+        yield _recorders[-1]
     finally:
-        _notes.pop()
+        _recorders.pop()
 
 
-def known() -> list[Hypothesis]:
-    """All hypotheses, the user's last."""
+def list_known_hypotheses() -> list[Hypothesis]:
+    """Return all hypotheses of the catalogue, then those that users registered."""
     return [*air.HYPOTHESES, *fabric.HYPOTHESES, *grip.HYPOTHESES, *observer.HYPOTHESES, *_registered]
 
 
-def catalogue(model: Model, recordings: Sequence[Recording]) -> list[Hypothesis]:
-    """All hypotheses that the recordings could say something about."""
-    without = () if "bending" in model.base.cloth.effects else fabric.OF_BENDING
-    asked = [h for h in model.others(known()) if h.effect not in without]
-    for own in _registered:
-        with blamed(own):
-            _refuse_taken(own, model)
-            any(own.needs(r) for r in recordings)
-    return [here(h, model, recordings) for h in asked if any(h.needs(r) for r in recordings)]
+def list_hypotheses(model: WorldModel, recordings: Sequence[Recording]) -> list[Hypothesis]:
+    """Return the hypotheses that recordings can inform about.
+
+    Args:
+        model: the base model; hypotheses that it has accepted are left out.
+        recordings: the episodes.
+    """
+    excluded = () if "bending" in model.base.cloth.effects else fabric.BENDING_EFFECTS
+    asked = [h for h in model.not_accepted(list_known_hypotheses()) if h.effect not in excluded]
+    for hypothesis in _registered:
+        with explaining_user_errors(hypothesis):
+            _check_effect_names(hypothesis, model)
+            any(hypothesis.is_applicable(r) for r in recordings)
+    return [adapt_hypothesis(h, model, recordings) for h in asked if any(h.is_applicable(r) for r in recordings)]
 
 
-def _refuse_taken(own: Hypothesis, model: Model) -> None:
-    """Of two effects of one name the later would silently take the place of the earlier."""
-    for name, effect in own.applied(model.base, own.typical).cloth.effects.items():
-        taken = name in TAKEN or name.startswith(BEGIN) or name.endswith(END)
-        if taken and not type(effect).__module__.startswith("torchcloth."):
+def _check_effect_names(hypothesis: Hypothesis, model: WorldModel) -> None:
+    """Raise InvalidInput for a name of the catalogue: the later effect would silently replace the earlier one."""
+    for name, effect in hypothesis.apply_to(model.base, hypothesis.typical).cloth.effects.items():
+        is_reserved = name in RESERVED_EFFECT_NAMES
+        is_reserved = is_reserved or name.startswith(RESERVED_PREFIX) or name.endswith(RESERVED_SUFFIX)
+        if is_reserved and not type(effect).__module__.startswith("torchcloth."):
             got = f"an effect {type(effect).__name__} named {name!r}, as the catalogue calls one of its own"
-            raise InvalidInput(f"hypothesis {own.name!r}", got=got, expected="another name")
+            raise InvalidInput(f"hypothesis {hypothesis.name!r}", got=got, expected="another name")
 
 
-def here(hypothesis: Hypothesis, model: Model, recordings: Sequence[Recording] = ()) -> Hypothesis:
-    """As these recordings have it: friction stays above none, and a table tells how high a camera stands."""
+def adapt_hypothesis(hypothesis: Hypothesis, model: WorldModel, recordings: Sequence[Recording] = ()) -> Hypothesis:
+    """Adapt a hypothesis to recordings: friction stays positive, and a table determines the height of a camera.
+
+    Args:
+        hypothesis: of the catalogue.
+        model: the base model.
+        recordings: the episodes.
+    """
     if hypothesis.name == "contact.mu":
-        return replace(hypothesis, low=grip.least_change(model.base.cloth))
+        return replace(hypothesis, min_amplitude=grip.compute_min_friction_change(model.base.cloth))
     if hypothesis.name == "obs.extrinsic[z]" and any(r.colliders for r in recordings):
-        return replace(hypothesis, kin=())
+        return replace(hypothesis, structurally_equivalent=())
     return hypothesis
 
 
-def own_among(asked: Sequence[Hypothesis]) -> list[Hypothesis]:
-    """Those that the catalogue does not have, registered or not.
+def select_user_hypotheses(asked: Sequence[Hypothesis]) -> list[Hypothesis]:
+    """Return the hypotheses that are not in the catalogue, registered or not.
 
     Raises:
-        InvalidInput: two of one name, or one that ``register`` would refuse for its numbers.
+        InvalidInput: two of one name, or one with invalid fields.
     """
     names = [h.name for h in asked]
-    if twice := sorted({name for name in names if names.count(name) > 1}):
-        raise InvalidInput("hypotheses", got=f"{twice[0]!r} twice", expected="each once")
-    theirs = {h.name for h in known()} - {h.name for h in _registered}
-    own = [h for h in asked if h.name not in theirs]
-    for hypothesis in own:
-        _check_size(hypothesis)
-    return own
+    if duplicates := sorted({name for name in names if names.count(name) > 1}):
+        raise InvalidInput("hypotheses", got=f"{duplicates[0]!r} twice", expected="each once")
+    in_catalogue = {h.name for h in list_known_hypotheses()} - {h.name for h in _registered}
+    user_hypotheses = [h for h in asked if h.name not in in_catalogue]
+    for hypothesis in user_hypotheses:
+        _check_fields(hypothesis)
+    return user_hypotheses

@@ -1,4 +1,4 @@
-"""Causes of a user's own, tried before anything long is simulated."""
+"""Checks of a user's hypotheses before anything long is simulated."""
 
 from __future__ import annotations
 
@@ -7,59 +7,65 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 
 from ...episodes.observed import Episode
-from ...episodes.user_errors import GIVES, blame
+from ...episodes.user_errors import EXPECTED_APPLY, explain_user_error
 from ...episodes.world import Hypothesis, World
 from ...errors import InvalidInput, TorchclothError
 
-NEAR = 1e-6  # of the typical amplitude: as good as none
-CONTINUOUS = 0.1  # of what the typical amplitude does, that such an amplitude may do
-NOTHING = 1e-9  # m
+NEGLIGIBLE_FRACTION = 1e-6  # of the typical amplitude
+MAX_NEGLIGIBLE_RESPONSE = 0.1  # response to a negligible amplitude, as a fraction of the typical one
+NO_RESPONSE_M = 1e-9
 
 
-def check_own(own: Sequence[Hypothesis], base: World, episodes: Sequence[Episode]) -> None:
-    """Simulate the first frames of every episode with each of them, and those of one with next to nothing of it.
+def check_user_hypotheses(hypotheses: Sequence[Hypothesis], base: World, episodes: Sequence[Episode]) -> None:
+    """Simulate the first frames of every episode with each hypothesis, and of one episode with hardly any of it.
+
+    Args:
+        hypotheses: those of a user.
+        base: the base model's world.
+        episodes: the episodes.
 
     Raises:
-        InvalidInput: one fails in an error of its own, gives no world, or does not end where the world is as it is.
+        InvalidInput: a hypothesis that raises an error, returns no world, or changes the world at amplitude 0.
     """
-    if not own:
+    if not hypotheses:
         return
     early = episodes[0].first_fraction(0.0)
-    plain = base.frames(early).x
-    for hypothesis in own:
-        with blamed(hypothesis):
-            moved = []
-            for amplitude in (NEAR * hypothesis.typical, hypothesis.typical):
-                world = hypothesis.applied(base, amplitude)
-                moved.append(float((world.frames(early).x - plain).square().mean().sqrt()))
+    plain = base.simulate_observed(early).x
+    for hypothesis in hypotheses:
+        with explaining_user_errors(hypothesis):
+            responses = []
+            for amplitude in (NEGLIGIBLE_FRACTION * hypothesis.typical, hypothesis.typical):
+                world = hypothesis.apply_to(base, amplitude)
+                responses.append(float((world.simulate_observed(early).x - plain).square().mean().sqrt()))
             for k, episode in enumerate(episodes):
-                world.driven(episode)
+                world.apply_motion(episode)
                 if k:
-                    world.frames(episode.first_fraction(0.0))
-            if not all(map(math.isfinite, moved)):
+                    world.simulate_observed(episode.first_fraction(0.0))
+            if not all(map(math.isfinite, responses)):
                 raise InvalidInput(
                     f"hypothesis {hypothesis.name!r}",
-                    got="frames that are no numbers",
-                    expected=GIVES,
+                    got="frames that are not finite",
+                    expected=EXPECTED_APPLY,
                 )
-            if moved[0] > CONTINUOUS * moved[1] + NOTHING:
+            if responses[0] > MAX_NEGLIGIBLE_RESPONSE * responses[1] + NO_RESPONSE_M:
                 raise InvalidInput(
                     f"hypothesis {hypothesis.name!r}",
-                    got=f"{1e3 * moved[0]:.2g} mm from next to nothing of it, {1e3 * moved[1]:.2g} mm from a usual one",
+                    got=f"{1e3 * responses[0]:.2g} mm from a negligible amplitude, {1e3 * responses[1]:.2g} mm from a "
+                    "typical one",
                     expected="amplitude 0 to be the world as it is",
-                    remedy="of a factor, take what it differs from 1 by",
+                    remedy="for a factor, take its difference from 1",
                 )
-        with blamed(hypothesis):  # on its own: a world that cannot have the other way passes
-            if hypothesis.reverses:
-                hypothesis.applied(base, hypothesis.opposite.typical).frames(early)
+        with explaining_user_errors(hypothesis):  # a world that cannot have the opposite amplitude is accepted
+            if hypothesis.is_reversible:
+                hypothesis.apply_to(base, hypothesis.opposite.typical).simulate_observed(early)
 
 
 @contextmanager
-def blamed(hypothesis: Hypothesis) -> Iterator[None]:
-    """Errors that are none of the library's are said by the place in the user's file; what a world cannot be passes.
+def explaining_user_errors(hypothesis: Hypothesis) -> Iterator[None]:
+    """Explain errors inside the block by their place in the user's file; the library's own errors are dropped.
 
     Raises:
-        InvalidInput: for them.
+        InvalidInput: an error of the user's code.
     """
     try:
         yield
@@ -67,6 +73,6 @@ def blamed(hypothesis: Hypothesis) -> Iterator[None]:
         if f"hypothesis {hypothesis.name!r}" in str(error):
             raise
     except TorchclothError:
-        pass  # the search says so
+        pass  # the search reports that the hypothesis cannot be simulated
     except Exception as error:
-        raise blame(hypothesis.name, error) from error
+        raise explain_user_error(hypothesis.name, error) from error

@@ -1,7 +1,8 @@
-"""The same model on a mesh twice as fine: what differs is numerics, no physics.
+"""The same model on a mesh twice as fine: the difference between both is discretisation error, not physics.
 
-Residuals are taken on the finer mesh, slopes on the coarser: an error of the slopes costs an iteration, an error of the
-residuals would be named as a cause. Slopes along what acts in folds, which a coarse mesh loses, are none there.
+Residuals are computed on the fine mesh, slopes on the coarse one. An error of the slopes costs an iteration, an error
+of the residuals would be named as a cause. Only effects that act in folds have their slopes on the fine mesh, because a
+coarse mesh does not resolve folds.
 """
 
 from __future__ import annotations
@@ -9,14 +10,16 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 
-from ...episodes.world import Model, World
-from ...identification.uncertainty.richardson import finer_cloth, finer_recording
+from ...episodes.world import World, WorldModel
+from ...identification.uncertainty.richardson import refine_cloth, refine_recording
 from ...recordings import Recording
 
 
-def refine_model(model: Model, recordings: Sequence[Recording]) -> tuple[Model, list[Recording]]:
-    """(model, recordings) with every triangle divided into four."""
+def refine_model(model: WorldModel, recordings: Sequence[Recording]) -> tuple[WorldModel, list[Recording]]:
+    """Return the model and the recordings with every triangle divided into four."""
     coarse = model.base.cloth
-    cloth = finer_cloth(coarse)
-    found = [finer_recording(r, coarse.mesh, cloth.mesh) for r in recordings]
-    return replace(model, base=World(cloth, model.base.motions, model.base.views)), found
+    cloth = refine_cloth(coarse)
+    recordings = [refine_recording(r, coarse.mesh, cloth.mesh) for r in recordings]
+    return replace(
+        model, base=World(cloth, model.base.motion_transforms, model.base.observation_transforms)
+    ), recordings

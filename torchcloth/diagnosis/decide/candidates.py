@@ -1,4 +1,8 @@
-"""One step of the search: the likeliest causes are fitted anew and compared on motions held out."""
+"""One step of the search: the most likely hypotheses are fitted, compared on held-out motions, and one is accepted.
+
+``evaluate_candidates`` is the step, ``accept`` decides whether a candidate may be named. The numbers are in
+``criteria``, which lists the gates in their order.
+"""
 
 from __future__ import annotations
 
@@ -6,363 +10,538 @@ import math
 from collections.abc import Collection, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from typing import Literal
 
-from ...episodes.world import Hypothesis, Model
-from ...episodes.world_cache import IMPOSSIBLE
-from ..data.dataset import Progress, DiagnosisData, prefix_progress
-from ..inference.comparison import Gain, HeldOutPrediction, compare_by_motion, compare, list_observed_motions, predict_held_out, jackknife, find_sole_informative_motion
-from ..inference.fitting import ModelFit, fit, reweight_by_noise, add_cause
-from ..inference.linearise import Linearisation, restrict_to_common_bins
-from ..inference.noise import Noise, fit_noise, cap_noise
-from ..inference.permutation_test import PermutationTest, run_permutation_test
-from ..inference.screening import MUCH, PRESENT, ScoreTest
-
-TRIED = 4  # hypotheses that are fitted at each step
-FURTHER = 3  # steps of the likelier ones among them
-HARDLY = 0.2  # of what the better of two models gains, in density and squares, that two engines may differ by
-VERY_MUCH = 25.0  # log density; nulls' causes that ask for too little to show reach 16, and 27 once
-SURELY = 8.0  # log density held out, beyond which no null's cause surely gains: of what no other motion predicts,
-# what is begun at the data sheet though nothing lacks, or what moves too little to be noticed
-SURELY_OF_FEW = VERY_MUCH  # the same of fewer motions than FEWEST: the other tells little of what is usual
-FEWEST = 3  # motions, of which one is held out: two name only what is overwhelming, and that is lacking
-CLEAR = 4.0  # log density below which two models predict alike
-PLAUSIBLE = 5.0  # times the typical amplitude; the prior's standard deviation is twice it
-BENT = (
-    5.0  # prior standard deviations, by which no other effect has bent a number of the fabric: up to 3.7 in 184 cases
+from ..._utils.constants import Z_95
+from ...episodes.world import Hypothesis, WorldModel
+from ...episodes.world_cache import IMPOSSIBLE_WORLD_ERRORS
+from ..data.dataset import DiagnosisData, Progress, prefix_progress
+from ..inference.comparison import (
+    Gain,
+    HeldOutPrediction,
+    compare,
+    compare_by_motion,
+    find_sole_informative_motion,
+    jackknife,
+    list_observed_motions,
+    predict_held_out,
 )
-POSSIBLE = 10.0  # the same, of what predicts as well as something plausible
-DISTURBED = 0.1  # of what is wrong in a motion, by which it is predicted worse
-MUCH_OF_ALL = 1 / 3  # that is wrong, of which predictions say that it is there
-# standard errors between motions, from which they agree that there is something: 97.5 % of Student's t by one less than
-# there are motions; of the best of TRIED causes, with a fourth of that chance
-SURE = (12.71, 4.30, 3.18, 2.78, 2.57, 2.45, 2.36, 2.31, 2.26)
-SURE_OF_BEST = (50.92, 8.86, 5.39, 4.31, 3.81, 3.52, 3.34, 3.21, 3.11)
-NORMAL = 1.96  # the same of what mends most of all that is wrong
-WORTH_SHARE = 0.02  # of the mean square, that a cause that is worth naming mends, or
-WORTH_MM, WORTH_PULL = 3e-4, 5e-3  # m or N, RMS of what is gone from one episode
+from ..inference.fitting import ModelFit, add_cause, fit, reweight_by_noise
+from ..inference.linearise import Linearisation, restrict_to_common_bins
+from ..inference.noise import Noise, cap_noise, fit_noise
+from ..inference.permutation_test import PermutationTest, run_permutation_test
+from ..inference.screening import ScoreTest
+from .criteria import CRITERIA, CandidateCriteria
+
+Role = Literal["new", "accepted", "rival"]
 
 
 @dataclass(frozen=True, eq=False)
 class Candidate:
-    """A hypothesis that was fitted."""
+    """A hypothesis that was fitted.
 
-    score: ScoreTest  # as screened
+    Attributes:
+        score: its score test.
+        fit: the model with it.
+        prediction: of held-out motions.
+        gain: over the model without it, on held-out motions.
+        sole_informative_motion: the motion that alone informs about it; empty in most cases.
+        t_threshold: standard errors between motions by which its amplitude must differ from zero.
+        worsens_another_motion: whether one motion alone informs about it and positions of another one are predicted
+            worse.
+        is_contradicted: whether, in addition, that other motion is clearly less likely.
+        restores_prior: whether a parameter that had left its data sheet returns to it.
+        prior_shift: prior standard deviations by which the parameter that it equals had left the data sheet.
+    """
+
+    score: ScoreTest
     fit: ModelFit
     prediction: HeldOutPrediction
-    gain: Gain  # over the model without it
-    sole_informative_motion: set[str]  # the motion that alone tells of it, if any
-    t_threshold: float  # standard errors between motions that it must be away from zero
-    worsens_another_motion: bool = False  # where one motion alone tells of it: positions of another are predicted worse
-    is_contradicted: bool = False  # likewise, and that motion is clearly less likely
-    restores_prior: bool = False  # a fitted number that had left its data sheet is back with it
-    prior_shift: float = 0.0  # prior standard deviations, by which its twin had left the data sheet without it
+    gain: Gain
+    sole_informative_motion: set[str]
+    t_threshold: float
+    worsens_another_motion: bool = False
+    is_contradicted: bool = False
+    restores_prior: bool = False
+    prior_shift: float = 0.0
 
     @property
     def hypothesis(self) -> Hypothesis:
-        """What was added."""
+        """The hypothesis that was added."""
         return self.score.hypothesis
 
     @property
     def amplitude(self) -> float:
-        """Of what was added."""
-        return self.fit.model.amplitudes[self.fit.model.place(self.hypothesis.name)]
+        """Its fitted amplitude, in the hypothesis's unit."""
+        return self.fit.model.amplitudes[self.fit.model.index_of(self.hypothesis.name)]
 
 
 @dataclass(frozen=True, eq=False)
 class AcceptedCause:
-    """One accepted cause with what cannot be told from it."""
+    """An accepted candidate with its rivals.
+
+    Attributes:
+        candidate: the accepted one.
+        permutation_test: the test that it passed.
+        tried: all candidates of the same step.
+        rivals: candidates that the data cannot distinguish from it.
+        scores: score tests before the step.
+        fit_before: the model without it, linearised along everything that was asked about.
+        noise: noise by which the candidates were compared.
+    """
 
     candidate: Candidate
-    permutation_test: PermutationTest  # that it passed
-    tried: list[Candidate]  # best among them
+    permutation_test: PermutationTest
+    tried: list[Candidate]
     rivals: list[Candidate]
     scores: list[ScoreTest]
-    fit_before: ModelFit  # the model without it, with slopes along everything that was asked about
-    noise: Noise  # by which they were compared
+    fit_before: ModelFit
+    noise: Noise
 
     def replaced_by(self, name: str) -> AcceptedCause | None:
-        """With another of the causes that were tried; None: it was not."""
-        best = next((c for c in self.tried if c.hypothesis.name == name), None)
-        if best is None:
+        """Return the step with another of the candidates that were tried; None if there is none of that name."""
+        other = next((c for c in self.tried if c.hypothesis.name == name), None)
+        if other is None:
             return None
-        others = [c for c in self.rivals if c is not best and c.hypothesis.implies != name]
-        return replace(self, best=best, rivals=others)
+        rivals = [c for c in self.rivals if c is not other and c.hypothesis.implies != name]
+        return replace(self, candidate=other, rivals=rivals)
 
 
-def sole_informative_motions(steps: Sequence[AcceptedCause]) -> set[str]:
-    """Motions that alone tell of one of the causes."""
-    return {name for step in steps for name in step.candidate.sole_informative_motion}
+def sole_informative_motions(accepted: Sequence[AcceptedCause]) -> set[str]:
+    """Return the motions that alone inform about one of the causes."""
+    return {motion for cause in accepted for motion in cause.candidate.sole_informative_motion}
 
 
-def _likely(screened: Sequence[ScoreTest]) -> list[ScoreTest]:
-    """What is present by slopes, or asks for so much that it would show and would matter or gain much.
+def select_likely(scores: Sequence[ScoreTest]) -> list[ScoreTest]:
+    """Return the hypotheses that are worth fitting, the largest expected gain first (gate 1).
 
-    A typical amplitude need not show then. And a large effect bends the fitted parameters so far that slopes
-    there ask for less of it than there is; so what gains very much is fitted, however little it asks for.
+    A hypothesis is worth fitting if it is present by its score test, or if so much of it is asked for that it would
+    show and would be relevant or gain much. A large effect shifts the fitted parameters so far that slopes there ask
+    for less of it than there is. So a hypothesis with a very large expected gain is always fitted.
     """
-    asks = lambda r: r.worth > VERY_MUCH or (r.shows and (r.worth > MUCH or r.excess > PRESENT))  # noqa: E731
-    likely = [r for r in screened if r.decision == "present" or asks(r)]
-    return sorted(likely, key=lambda r: -r.expected_gain)
+    screening = CRITERIA.screening
+
+    def is_likely(score: ScoreTest) -> bool:
+        if score.decision == "present" or score.expected_gain > CRITERIA.candidate.overwhelming_gain:
+            return True
+        is_promising = score.expected_gain > screening.min_expected_gain
+        return score.is_visible and (is_promising or score.z_above_smallest > screening.min_z_above_smallest)
+
+    return sorted(filter(is_likely, scores), key=lambda score: -score.expected_gain)
 
 
-def propose_candidates(found: ModelFit, screened: Sequence[ScoreTest], tried: int, after: int = 0) -> list[tuple[ScoreTest, Model]]:
-    """The likeliest causes ``after`` so many, each with the model to which one leap leads."""
-    return [(row, add_cause(found, row.hypothesis)) for row in _likely(screened)[after : after + tried]]
+def propose_candidates(
+    fitted: ModelFit, scores: Sequence[ScoreTest], count: int, skip: int = 0
+) -> list[tuple[ScoreTest, WorldModel]]:
+    """Return the most likely hypotheses, each with the model to which one robust step leads (gate 2).
+
+    Args:
+        fitted: fit without them.
+        scores: score tests of that fit.
+        count: largest number of hypotheses.
+        skip: number of more likely ones that are left out.
+    """
+    return [(score, add_cause(fitted, score.hypothesis)) for score in select_likely(scores)[skip : skip + count]]
 
 
 def evaluate_candidates(
     current: ModelFit,
-    setting: DiagnosisData,
-    begun: Sequence[tuple[ScoreTest, Model]],
-    screened: list[ScoreTest],
+    data: DiagnosisData,
+    proposed: Sequence[tuple[ScoreTest, WorldModel]],
+    scores: list[ScoreTest],
     progress: Progress,
-    more: Sequence[tuple[ScoreTest, Model]] = (),
+    more: Sequence[tuple[ScoreTest, WorldModel]] = (),
 ) -> AcceptedCause | None:
-    """The best of what was ``begun`` that is worth its name, with what cannot be told from it; None: nothing is.
-
-    Where what predicts best is larger than is believed, what looks like it may be among the next likely ones.
+    """Fit candidates, compare them on held-out motions, and accept the best one that may be named.
 
     Args:
-        current: the model so far, asked about what was begun.
-        setting: the episodes.
-        begun: (row as screened, model to fit) of each.
-        screened: all rows, for the record.
+        current: the model so far, linearised along the hypotheses.
+        data: the episodes.
+        proposed: (score test, model to start the fit from) of each candidate.
+        scores: all score tests, for the record.
         progress: called with one line for each episode that is simulated.
-        more: as ``begun``, tried where that leads to nothing that can be believed.
+        more: further candidates, tried if the best one is implausibly large: what looks like it may be among them.
+
+    Returns:
+        The accepted cause with its rivals; None if no candidate may be named.
     """
-    likely = _tried(current, setting, begun, progress)
+    likely = _fit_candidates(current, data, proposed, progress)
     if not likely:
         return None
-    if more and not _plausible(max(likely, key=lambda c: c.gain.log_density)):
-        likely += _tried(current, setting, more, progress)
-    likeliest = max(likely, key=lambda c: c.gain.log_density).fit.linearisation
-    # an effect that slopes describe badly has passed as noise until now: what the likeliest leaves over is the noise
+    if more and not _is_plausible(max(likely, key=lambda c: c.gain.log_density), CRITERIA.candidate.max_typical):
+        likely += _fit_candidates(current, data, more, progress)
+
+    # An effect that slopes describe badly has passed as noise so far. What the most likely candidate leaves is the
+    # noise.
+    best_fit = max(likely, key=lambda c: c.gain.log_density).fit.linearisation
     fits = [(c.score, c.fit) for c in likely]
-    noise, like = fit_noise(likeliest), _common(likeliest, current, fits)
-    tried = _compare_held_out(current, fits, setting.motions, noise, like)
-    useful = _ranked(_themselves([c for c in tried if _useful(c, setting.motions)]))
-    others = [c for c in tried if c not in useful]
-    beside = lambda c: run_permutation_test(reweight_by_noise(c.fitted, noise, like), setting.motions, c.alone)  # noqa: E731
-    chance = None
-    while useful and not (chance := beside(useful[0])).is_passed:
-        others, useful = [*others, useful[0]], useful[1:]
-    if not useful or chance is None:
+    noise, common = fit_noise(best_fit), _restrict_to_all(best_fit, current, fits)
+    tried = _compare_held_out(current, fits, data.motions, noise, common)
+
+    # Gates 5 to 10, then the permutation test of the best one (gate 11). If it fails, the next one is tested.
+    named = _rank(drop_implied([c for c in tried if accept(c, data.motions)]))
+    others, test = [c for c in tried if c not in named], None
+    while named:
+        fitted = reweight_by_noise(named[0].fit, noise, common)
+        test = run_permutation_test(fitted, data.motions, named[0].sole_informative_motion)
+        if test.is_passed:
+            break
+        others, named = [*others, named[0]], named[1:]
+    if not named or test is None:
         return None
-    best = useful[0]
-    alike = lambda c: predict_held_out(reweight_by_noise(c.fitted, noise, like), setting.motions, best.sole_informative_motion)  # noqa: E731
-    possible = [*useful, *(c for c in others if worth_naming(c, c.gain) and _agreed(c, setting.motions))]
-    rivals = {c.hypothesis.name: c for c in reversed(possible) if c is not best and _rival(c, alike(c), best)}
-    rivals |= {c.hypothesis.name: c for c in others if _open(c, alike(c), best)}
-    return AcceptedCause(best, chance, tried, [*reversed(rivals.values())], screened, current, noise)
+    best = named[0]
+
+    # Rivals predict about as well, or clearly better although motions do not agree about their size.
+    def predict_as_best(c: Candidate) -> HeldOutPrediction:
+        fitted = reweight_by_noise(c.fit, noise, common)
+        return predict_held_out(fitted, data.motions, best.sole_informative_motion)
+
+    possible = [*named, *(c for c in others if accept(c, data.motions, role="rival"))]
+    rivals = {
+        c.hypothesis.name: c
+        for c in reversed(possible)
+        if c is not best and _predicts_as_well(c, predict_as_best(c), best)
+    }
+    rivals |= {c.hypothesis.name: c for c in others if _predicts_clearly_better(c, predict_as_best(c), best)}
+    return AcceptedCause(best, test, tried, [*reversed(rivals.values())], scores, current, noise)
 
 
-def _tried(
-    current: ModelFit, setting: DiagnosisData, begun: Sequence[tuple[ScoreTest, Model]], progress: Progress
+def _fit_candidates(
+    current: ModelFit,
+    data: DiagnosisData,
+    proposed: Sequence[tuple[ScoreTest, WorldModel]],
+    progress: Progress,
 ) -> list[Candidate]:
-    """What was begun, fitted as far as that leads, beside the model without it; less what cannot be simulated."""
+    """Fit candidates and compare them with the model without them (gates 3 and 4)."""
+    criteria = CRITERIA.candidate
+
+    # Gate 3: a candidate that cannot be simulated is dropped.
     fits: list[tuple[ScoreTest, ModelFit]] = []
-    by = cap_noise(current.noise)
-    for row, model in begun:
-        trial = prefix_progress(progress, f"trying {row.hypothesis.name}")
-        with suppress(*IMPOSSIBLE):
-            fits.append((row, fit(model, setting, (), 0, trial, by, current.linearisation)))
-    judged = lambda fits, every: _compare_held_out(  # noqa: E731
-        current, fits, setting.motions, current.noise, _common(current.linearisation, current, every)
-    )
-    likely = judged(fits, fits)
-    settled = _settled(likely, setting, progress)
-    first, further = [fits[k] for k in settled], list(settled.values())
-    both = (judged(own, [*fits, *further]) for own in (first, further))
-    for k, before, after in zip(settled, *both, strict=True):
-        likely[k] = _better(before, after)
-    return likely
+    noise = cap_noise(current.noise)
+    for score, model in proposed:
+        stage = prefix_progress(progress, f"trying {score.hypothesis.name}")
+        with suppress(*IMPOSSIBLE_WORLD_ERRORS):
+            fits.append((score, fit(model, data, (), 0, stage, noise, current.linearisation)))
+
+    def compare_fits(
+        some: list[tuple[ScoreTest, ModelFit]], every: list[tuple[ScoreTest, ModelFit]]
+    ) -> list[Candidate]:
+        common = _restrict_to_all(current.linearisation, current, every)
+        return _compare_held_out(current, some, data.motions, current.noise, common)
+
+    # Gate 4: one step suffices for small effects only. A candidate is fitted further if it predicts well or promises
+    # much: a large effect that is half fitted predicts nothing.
+    candidates = compare_fits(fits, fits)
+    promise = [c.gain.log_density + c.fit.expected_gain for c in candidates]
+    refitted: dict[int, tuple[ScoreTest, ModelFit]] = {}
+    for k, (c, expected) in enumerate(zip(candidates, promise, strict=True)):
+        is_promising = expected > max(0.0, criteria.min_relative_promise * max(promise))
+        if is_promising and c.fit.expected_gain > criteria.equal_density:
+            stage = prefix_progress(progress, f"trying {c.hypothesis.name} further")
+            start = c.fit.linearisation
+            further = fit(c.fit.model, data, (), criteria.further_iterations, stage, c.fit.noise, start, start)
+            refitted[k] = (c.score, further)
+    first, further = [fits[k] for k in refitted], list(refitted.values())
+    compared = (compare_fits(some, [*fits, *further]) for some in (first, further))
+    for k, before, after in zip(refitted, *compared, strict=True):
+        candidates[k] = _choose_fit(before, after)
+    return candidates
 
 
-def _common(like: Linearisation, current: ModelFit, fits: Sequence[tuple[ScoreTest, ModelFit]]) -> Linearisation:
-    """On the cells that all of these have."""
-    return restrict_to_common_bins(like, [current.linearisation, *(f.linearisation for _, f in fits)])
+def _restrict_to_all(
+    target: Linearisation, current: ModelFit, fits: Sequence[tuple[ScoreTest, ModelFit]]
+) -> Linearisation:
+    """Return ``target`` on the bins that all fits have."""
+    return restrict_to_common_bins(target, [current.linearisation, *(f.linearisation for _, f in fits)])
 
 
-def _settled(tried: list[Candidate], setting: DiagnosisData, progress: Progress) -> dict[int, tuple[ScoreTest, ModelFit]]:
-    """The likelier ones, by number, where further steps lead: one step does for small effects only.
+def _choose_fit(before: Candidate, after: Candidate) -> Candidate:
+    """Return the candidate after further steps, unless it predicts clearly worse.
 
-    Likely is what predicts well or still has far to go: a large effect that is half fitted predicts nothing.
+    A fit that ended at amplitude zero was no fit of the hypothesis, so further steps always replace it.
     """
-    hope = [c.gain.log_density + c.fit.expected_gain for c in tried]
-    out = {}
-    for k, (c, expected) in enumerate(zip(tried, hope, strict=True)):
-        found = c.fit
-        if expected > max(0.0, 0.5 * max(hope)) and found.expected_gain > CLEAR:
-            further = prefix_progress(progress, f"trying {c.hypothesis.name} further")
-            found = fit(found.model, setting, (), FURTHER, further, found.noise, found.linearisation, found.linearisation)
-            out[k] = (c.score, found)
-    return out
-
-
-def _better(before: Candidate, after: Candidate) -> Candidate:
-    """Further steps, unless they predict clearly worse; what has ended at nothing was no fit of the cause."""
-    worse = after.gain.log_density < before.gain.log_density - HARDLY * abs(before.gain.log_density)
-    return before if worse and (before.amplitude or not after.amplitude) else after
+    tolerance = CRITERIA.candidate.simulator_tolerance * abs(before.gain.log_density)
+    is_worse = after.gain.log_density < before.gain.log_density - tolerance
+    return before if is_worse and (before.amplitude or not after.amplitude) else after
 
 
 def _compare_held_out(
-    current: ModelFit, fits: list[tuple[ScoreTest, ModelFit]], names: list[str], noise: Noise, like: Linearisation
+    current: ModelFit,
+    fits: list[tuple[ScoreTest, ModelFit]],
+    motions: list[str],
+    noise: Noise,
+    common: Linearisation,
 ) -> list[Candidate]:
-    """Each fit beside the model without it, on motions held out; all by one noise, on the cells of ``like``."""
-    before, out = reweight_by_noise(current, noise, like), []
-    strained = {p.name for p, _ in current.model.strained}
-    for row, found in fits:
-        after = reweight_by_noise(found, noise, like)
-        alone = find_sole_informative_motion(after, names)
-        first, predicted = (predict_held_out(f, names, alone) for f in (before, after))
-        gain = compare(first, predicted, 0.0)
-        worse = _disturbed(first, predicted, names, alone) if alone else []
-        contradicted = any(motion.log_density < -CLEAR for motion in worse)
-        sure = standard_errors(gain, list_observed_motions(predicted.episode, names), alone, not current.model.accepted)
-        relieves = bool(strained - {p.name for p, _ in found.model.strained})
-        bent = _bent(current.model, row.hypothesis.equivalent_parameter)
-        out.append(Candidate(row, found, predicted, gain, alone, sure, bool(worse), contradicted, relieves, bent))
-    return out
+    """Compare each fit with the model without it on held-out motions, by one noise on common bins."""
+    before, candidates = reweight_by_noise(current, noise, common), []
+    strained = {p.name for p, _ in current.model.strained_parameters}
+    for score, fitted in fits:
+        after = reweight_by_noise(fitted, noise, common)
+        sole = find_sole_informative_motion(after, motions)
+        first, second = (predict_held_out(f, motions, sole) for f in (before, after))
+        gain = compare(first, second, 0.0)
+        worsened = _find_worsened_motions(first, second, motions, sole) if sole else []
+        observed = list_observed_motions(second.episode, motions)
+        candidates.append(
+            Candidate(
+                score=score,
+                fit=fitted,
+                prediction=second,
+                gain=gain,
+                sole_informative_motion=sole,
+                t_threshold=choose_t_threshold(gain, observed, sole, is_first=not current.model.accepted),
+                worsens_another_motion=bool(worsened),
+                is_contradicted=any(g.log_density < -CRITERIA.candidate.equal_density for g in worsened),
+                restores_prior=bool(strained - {p.name for p, _ in fitted.model.strained_parameters}),
+                prior_shift=_measure_prior_shift(current.model, score.hypothesis.equivalent_parameter),
+            )
+        )
+    return candidates
 
 
-def _bent(model: Model, twin: str) -> float:
-    """Prior standard deviations of a parameter from its data sheet; 0 where the model has none of that name."""
-    away = zip(model.parameters, model.values.tolist(), strict=True)
-    return max((abs(c) / p.std for p, c in away if p.name == twin), default=0.0)
+def _measure_prior_shift(model: WorldModel, parameter: str) -> float:
+    """Return the prior standard deviations of a parameter from its data sheet; 0 if the model does not have it."""
+    shifts = zip(model.parameters, model.coordinates.tolist(), strict=True)
+    return max((abs(c) / p.prior_std for p, c in shifts if p.name == parameter), default=0.0)
 
 
-def _disturbed(first: HeldOutPrediction, second: HeldOutPrediction, names: Sequence[str], alone: set[str]) -> list[Gain]:
-    """Of the other motions, those whose positions are predicted worse."""
-    motions = compare_by_motion(first, second, 0.0, names).items()
-    return [m for name, m in motions if name not in alone and m.rms_after > (1 + DISTURBED) * m.rms_before]
+def _find_worsened_motions(
+    first: HeldOutPrediction, second: HeldOutPrediction, motions: Sequence[str], sole: set[str]
+) -> list[Gain]:
+    """Return the gains of other motions whose positions are predicted worse."""
+    gains = compare_by_motion(first, second, 0.0, motions).items()
+    factor = 1 + CRITERIA.candidate.worsened_rms
+    return [g for motion, g in gains if motion not in sole and g.rms_after > factor * g.rms_before]
 
 
-def standard_errors(gain: Gain, names: Sequence[str], alone: set[str], first: bool) -> float:
-    """Standard errors between motions from which they agree that there is something.
+def choose_t_threshold(gain: Gain, motions: Sequence[str], sole: set[str], is_first: bool) -> float:
+    """Return the standard errors between motions by which an amplitude must differ from zero.
 
-    A further cause is the best of those tried on what a first one left, some of which is that one described badly.
+    A further cause is the best of several on what a first one left, part of which is the first one badly described.
+
+    Args:
+        gain: gain of the cause.
+        motions: motions that were observed.
+        sole: the motion that alone informs about the cause, if any.
+        is_first: whether the model has no cause yet.
     """
-    # Of what mends that much of all that is wrong in motions it was not fitted to, predictions have said that it is
-    # there; real motions may then differ about its size. Two motions differ once, which tells nothing.
-    if first and len(set(names)) >= FEWEST and gain.rms_before**2 - gain.rms_after**2 > MUCH_OF_ALL * gain.rms_before**2:
-        return NORMAL
-    return between_motions(names, alone, SURE if first else SURE_OF_BEST)
+    criteria = CRITERIA.candidate
+    # If a first cause removes a large part of the misfit of held-out motions, the predictions have shown that it is
+    # there, and motions may differ about its size. Two motions differ only once, which says nothing.
+    removed = gain.rms_before**2 - gain.rms_after**2
+    is_dominant = removed > criteria.dominant_fraction * gain.rms_before**2
+    if is_first and len(set(motions)) >= criteria.min_motions and is_dominant:
+        return Z_95
+    return look_up_t_quantile(motions, sole, criteria.t_quantiles if is_first else criteria.t_quantiles_best_of_four)
 
 
-def between_motions(names: Sequence[str], alone: Collection[str] = (), table: Sequence[float] = SURE) -> float:
-    """Standard errors by which a mean over so few motions may be off; one that is ``alone`` counts as two.
+def look_up_t_quantile(
+    motions: Sequence[str], sole: Collection[str] = (), table: Sequence[float] = CRITERIA.candidate.t_quantiles
+) -> float:
+    """Return Student's quantile for a mean over motions; infinite for a single motion.
 
-    One motion agrees with nothing.
+    Args:
+        motions: motions that were observed.
+        sole: motions that alone inform; each counts as two, because it is halved.
+        table: quantiles by degrees of freedom.
     """
-    count = len(set(names)) + len(alone)
+    count = len(set(motions)) + len(sole)
     return table[min(count - 2, len(table) - 1)] if count > 1 else math.inf
 
 
-def _open(c: Candidate, predicted: HeldOutPrediction, best: Candidate) -> bool:
-    """Predicts clearly better, though motions do not agree how large it is: the best of the others is not the cause."""
-    h = c.hypothesis
-    stands_in = bool(h.implies) and not h.is_relevant(c.amplitude)
-    if h.effect == best.hypothesis.effect or stands_in or not (worth_naming(c, c.gain) and _plausible(c, POSSIBLE)):
-        return False
-    over = compare(predicted, best.prediction, 0.0)
-    return over.log_density < -CLEAR and over.log_density_ci95[1] < 0
+def accept(
+    candidate: Candidate,
+    motions: Sequence[str],
+    fitted: ModelFit | None = None,
+    gain: Gain | None = None,
+    role: Role = "new",
+    criteria: CandidateCriteria = CRITERIA.candidate,
+) -> bool:
+    """Decide whether a candidate may be named (gates 5 to 9).
 
+    A rival is held to a weaker test than a cause: it need not be there, it only must not be excluded by the data.
 
-def _plausible(c: Candidate, most: float = PLAUSIBLE) -> bool:
-    return abs(c.amplitude) < most * abs(c.hypothesis.typical)
-
-
-def _useful(c: Candidate, names: Sequence[str]) -> bool:
-    """What one motion alone tells has predicted no other one: it must surely gain what nulls' causes do not."""
-    few = len(set(list_observed_motions(c.prediction.episode, names))) < FEWEST
-    sure = not c.sole_informative_motion or c.gain.lower_bound_95 > (SURELY_OF_FEW if few else SURELY)
-    return sure and worth_naming(c, c.gain) and known(c.fit, c.hypothesis.name, names, c)
-
-
-def _agreed(c: Candidate, names: Sequence[str]) -> bool:
-    """Of what predicts as well as a cause, less is asked than of a cause: it need not be there, it cannot be told.
-
-    Halves of the one motion that tells of it need not agree: a law that is not quite right differs from early to late.
-    Nor does a cause stand alone because its rival is a hair larger than is believed.
+    Args:
+        candidate: the candidate.
+        motions: label of each episode.
+        fitted: a model with the candidate; None: its own fit.
+        gain: gain over that model without the candidate; None: its own gain.
+        role: "new" for a new cause, "accepted" for a cause that is in the model and is judged again, "rival" for what
+            may be there instead of a cause.
+        criteria: thresholds.
     """
-    return known(c.fit, c.hypothesis.name, names, replace(c, sure=0.0 if c.sole_informative_motion else NORMAL), POSSIBLE)
+    fitted = candidate.fit if fitted is None else fitted
+    gain = candidate.gain if gain is None else gain
 
+    # Gate 5. If one motion alone informs about a new cause, the cause has predicted no other motion. Then its gain must
+    # be larger than that of any cause of a null case.
+    if role == "new" and candidate.sole_informative_motion:
+        n_motions = len(set(list_observed_motions(candidate.prediction.episode, motions)))
+        has_few = n_motions < criteria.min_motions
+        min_gain = criteria.certain_gain_few_motions if has_few else criteria.certain_gain
+        if not candidate.gain.lower_bound_95 > min_gain:
+            return False
 
-def known(found: ModelFit, name: str, names: Sequence[str], c: Candidate, most: float = PLAUSIBLE) -> bool:
-    """Of a size that makes sense and that numerics do not ask for, and motions agree so far that there is something.
-
-    It makes sense up to ``most`` times the typical amplitude; what has ended at nothing is not there. Halves of the one
-    motion that tells of it need not agree about its size where it gains overwhelmingly in both and leaves all others as
-    they were: what creases do levels off with their rate, and its slopes there say little. Where another motion is
-    clearly less likely with it, it is not there, whatever it gains. Nor need motions agree about a number that has left
-    its data sheet so far that nothing else has bent it there.
-    """
-    if c.is_contradicted and c.prior_shift <= BENT:
+    # Gates 6 and 7. It improves the predictions noticeably, or its equivalent parameter contradicts the data sheet.
+    if not is_improvement(candidate, gain, criteria):
         return False
-    place = found.model.place(name)
-    amplitude, largest = found.model.amplitudes[place], most * abs(found.model.accepted[place].typical)
-    middle, std = (float(v[len(found.model.parameters) + place]) for v in jackknife(found, names, c.sole_informative_motion))
-    if (c.sole_informative_motion and c.gain.lower_bound_95 > VERY_MUCH and not c.worsens_another_motion) or c.prior_shift > BENT:
-        middle, std = amplitude, 0.0
-    least = max(c.t_threshold * std, NORMAL * abs(c.score.mesh_bias))
-    return c.t_threshold < math.inf and least < abs(middle) and 0 < abs(amplitude) < largest
 
-
-def worth_naming(c: Candidate, gain: Gain) -> bool:
-    """As ``worthwhile``; what is the same as a number that is fitted (a twin) must show beside the data sheet instead.
-
-    Beside such a number nothing is left to mend.
-    """
-    return gain.lower_bound_95 > 0 or far_from_sheet(c, gain) if _twin(c) else worthwhile(gain)
-
-
-def far_from_sheet(c: Candidate, gain: Gain) -> bool:
-    """A twin of a number that is surely far off: with that number bent it predicts as well, and need not gain more."""
-    if not _twin(c) or gain.log_density <= CLEAR:
+    # Gate 9, first part. No other motion is clearly less likely with it, unless the equivalent parameter has shifted so
+    # far that nothing else shifts it there.
+    is_shifted = candidate.prior_shift > criteria.max_prior_shift
+    if candidate.is_contradicted and not is_shifted:
         return False
-    return c.prior_shift > BENT or (c.score.decision == "present" and c.score.expected_gain > VERY_MUCH)
 
-
-def _twin(c: Candidate) -> bool:
-    """The same as a number that is fitted anyway, and shows beside its data sheet."""
-    return bool(c.hypothesis.equivalent_parameter) and c.hypothesis.equivalent_parameter in (p.name for p in c.fit.model.parameters) and c.score.is_visible
-
-
-def worthwhile(gain: Gain) -> bool:
-    """Large enough to be noticed, or surer than what chance gains, and surely a gain.
-
-    Beside numbers that the cause has bent, hardly a millimetre may be left to mend.
-    """
-    seen, felt = gain.rms_removed
-    mended = gain.mean_square_removed > WORTH_SHARE * gain.robust_rms[0] ** 2 or seen > WORTH_MM or felt > WORTH_PULL
-    return (mended or gain.lower_bound_95 > SURELY) and gain.lower_bound_95 > 0 and not worsens(gain)
-
-
-def worsens(gain: Gain) -> bool:
-    """All positions together are predicted worse, whatever else is, and pulls hardly better."""
-    return gain.rms_after > gain.rms_before and gain.rms_removed[1] < WORTH_PULL
-
-
-def _themselves(useful: Sequence[Candidate]) -> list[Candidate]:
-    """Less those that matter by what they bring along alone, which then predicts about as well without them."""
-    found = {c.hypothesis.name: c for c in useful}
-    brought = lambda c: None if c.hypothesis.matters(c.amplitude) else found.get(c.hypothesis.brings)  # noqa: E731
-    alike = lambda c, other: other.gain.density > (1 - HARDLY) * c.gain.density  # noqa: E731
-    return [c for c in useful if (other := brought(c)) is None or not alike(c, other)]
-
-
-def _ranked(useful: Sequence[Candidate]) -> list[Candidate]:
-    """The likeliest first; of those that predict as well as that, the one that mends most."""
-    likeliest = max((c.gain.log_density for c in useful), default=0.0)
-    alike = lambda c: c.gain.density > likeliest - CLEAR  # noqa: E731
-    return sorted(useful, key=lambda c: (0, -c.gain.mean_square_removed) if alike(c) else (1, -c.gain.log_density))
-
-
-def _rival(c: Candidate, predicted: HeldOutPrediction, best: Candidate) -> bool:
-    """Predicts about as well: the paired difference is not clear, or no more than what two engines may differ by."""
-    h = c.hypothesis
-    if h.effect == best.hypothesis.effect or (h.implies == best.hypothesis.name and not h.is_relevant(c.amplitude)):
+    # Gate 8. Motions agree that the amplitude is not zero, and the mesh error does not explain it. Halves of the sole
+    # informative motion need not agree about the size if the gain is overwhelming in both and all other motions stay as
+    # they were: creases level off with their rate, and slopes say little there. Halves of such a motion need not agree
+    # about a rival either, because a law that is not quite right differs from early to late.
+    index = fitted.model.index_of(candidate.hypothesis.name)
+    amplitude, typical = fitted.model.amplitudes[index], fitted.model.accepted[index].typical
+    coordinate = len(fitted.model.parameters) + index
+    mean, std = (float(v[coordinate]) for v in jackknife(fitted, motions, candidate.sole_informative_motion))
+    is_overwhelming = (
+        bool(candidate.sole_informative_motion)
+        and candidate.gain.lower_bound_95 > criteria.overwhelming_gain
+        and not candidate.worsens_another_motion
+    )
+    if is_overwhelming or is_shifted:
+        mean, std = amplitude, 0.0
+    t_threshold = candidate.t_threshold
+    if role == "rival":
+        t_threshold = 0.0 if candidate.sole_informative_motion else Z_95
+    if t_threshold == math.inf or not max(t_threshold * std, Z_95 * abs(candidate.score.mesh_bias)) < abs(mean):
         return False
-    over = compare(predicted, best.prediction, 0.0)
-    hardly = over.log_density < HARDLY * best.gain.log_density and over.mean_square_removed < HARDLY * best.gain.mean_square_removed
-    return over.log_density < CLEAR or over.lower_bound_95 < 0 or hardly
+
+    # Gate 9, second part. The amplitude is plausible; a fit that ended at zero is no cause. A cause does not stand
+    # alone
+    # because its rival is a little too large.
+    max_typical = criteria.max_typical_of_rival if role == "rival" else criteria.max_typical
+    return 0 < abs(amplitude) < max_typical * abs(typical)
+
+
+def is_improvement(c: Candidate, gain: Gain, criteria: CandidateCriteria = CRITERIA.candidate) -> bool:
+    """Check whether a candidate improves the predictions enough to be named (gates 6 and 7).
+
+    Beside the parameter that it equals nothing is left to remove, so such a candidate only has to gain surely, or to
+    contradict the data sheet.
+
+    Args:
+        c: the candidate.
+        gain: its gain on held-out motions.
+        criteria: thresholds.
+    """
+    if not _equals_fitted_parameter(c):
+        return is_worthwhile(gain, criteria)
+    return gain.lower_bound_95 > 0 or contradicts_data_sheet(c, gain, criteria)
+
+
+def contradicts_data_sheet(c: Candidate, gain: Gain, criteria: CandidateCriteria = CRITERIA.candidate) -> bool:
+    """Check whether a candidate equals a fitted parameter whose data sheet is surely wrong (gate 7).
+
+    With that parameter shifted the model predicts as well, so the candidate need not gain more.
+
+    Args:
+        c: the candidate.
+        gain: its gain on held-out motions.
+        criteria: thresholds.
+    """
+    if not _equals_fitted_parameter(c) or gain.log_density <= criteria.equal_density:
+        return False
+    is_certain = c.score.decision == "present" and c.score.expected_gain > criteria.overwhelming_gain
+    return c.prior_shift > criteria.max_prior_shift or is_certain
+
+
+def _equals_fitted_parameter(c: Candidate) -> bool:
+    """Whether the candidate equals a parameter of the model and shows beside its data sheet."""
+    parameter = c.hypothesis.equivalent_parameter
+    return bool(parameter) and parameter in (p.name for p in c.fit.model.parameters) and c.score.is_visible
+
+
+def is_worthwhile(gain: Gain, criteria: CandidateCriteria = CRITERIA.candidate) -> bool:
+    """Check whether a gain is certain, and large enough to be noticed or larger than any chance (gate 6).
+
+    Beside parameters that the cause has shifted, hardly a millimetre may be left to remove.
+
+    Args:
+        gain: gain on held-out motions.
+        criteria: thresholds.
+    """
+    displacement, force = gain.rms_removed
+    is_noticeable = (
+        gain.mean_square_removed > criteria.min_square_fraction * gain.robust_rms[0] ** 2
+        or displacement > criteria.min_displacement_m
+        or force > criteria.min_force_n
+    )
+    is_large = is_noticeable or gain.lower_bound_95 > criteria.certain_gain
+    return is_large and gain.lower_bound_95 > 0 and not worsens_positions(gain, criteria)
+
+
+def worsens_positions(gain: Gain, criteria: CandidateCriteria = CRITERIA.candidate) -> bool:
+    """Check whether all positions together are predicted worse and forces hardly better.
+
+    Args:
+        gain: gain on held-out motions.
+        criteria: thresholds.
+    """
+    return gain.rms_after > gain.rms_before and gain.rms_removed[1] < criteria.min_force_n
+
+
+def drop_implied(named: Sequence[Candidate]) -> list[Candidate]:
+    """Drop candidates that are relevant only by what they imply, if that predicts about as well alone (gate 10)."""
+    by_name = {c.hypothesis.name: c for c in named}
+    tolerance = CRITERIA.candidate.simulator_tolerance
+
+    def is_explained_by_implied(c: Candidate) -> bool:
+        implied = None if c.hypothesis.is_relevant(c.amplitude) else by_name.get(c.hypothesis.implies)
+        return implied is not None and implied.gain.log_density > (1 - tolerance) * c.gain.log_density
+
+    return [c for c in named if not is_explained_by_implied(c)]
+
+
+def _rank(named: Sequence[Candidate]) -> list[Candidate]:
+    """Sort by log density; among those that predict as well as the best, by the mean square that they remove."""
+    best = max((c.gain.log_density for c in named), default=0.0)
+
+    def key(c: Candidate) -> tuple[int, float]:
+        if c.gain.log_density > best - CRITERIA.candidate.equal_density:
+            return 0, -c.gain.mean_square_removed
+        return 1, -c.gain.log_density
+
+    return sorted(named, key=key)
+
+
+def _is_plausible(c: Candidate, max_typical: float) -> bool:
+    return abs(c.amplitude) < max_typical * abs(c.hypothesis.typical)
+
+
+def _predicts_as_well(c: Candidate, prediction: HeldOutPrediction, best: Candidate) -> bool:
+    """Whether a candidate predicts about as well as the best one.
+
+    The paired difference is not clear, or no more than what two simulators may differ by.
+    """
+    h, criteria = c.hypothesis, CRITERIA.candidate
+    is_implication = h.implies == best.hypothesis.name and not h.is_relevant(c.amplitude)
+    if h.effect == best.hypothesis.effect or is_implication:
+        return False
+    over, tolerance = compare(prediction, best.prediction, 0.0), criteria.simulator_tolerance
+    is_within_tolerance = (
+        over.log_density < tolerance * best.gain.log_density
+        and over.mean_square_removed < tolerance * best.gain.mean_square_removed
+    )
+    return over.log_density < criteria.equal_density or over.lower_bound_95 < 0 or is_within_tolerance
+
+
+def _predicts_clearly_better(c: Candidate, prediction: HeldOutPrediction, best: Candidate) -> bool:
+    """Whether a candidate about whose size motions disagree predicts clearly better than the best of the others.
+
+    Then the best of the others is not the cause alone.
+    """
+    h, criteria = c.hypothesis, CRITERIA.candidate
+    is_implication = bool(h.implies) and not h.is_relevant(c.amplitude)
+    if h.effect == best.hypothesis.effect or is_implication:
+        return False
+    if not (is_improvement(c, c.gain) and _is_plausible(c, criteria.max_typical_of_rival)):
+        return False
+    over = compare(prediction, best.prediction, 0.0)
+    return over.log_density < -criteria.equal_density and over.log_density_ci95[1] < 0

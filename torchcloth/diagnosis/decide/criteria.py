@@ -22,7 +22,8 @@ the function that applies the gate and the class below that holds its numbers.
 10. It is not explained by the hypothesis that it implies: ``candidates.evaluate_candidates`` (``CandidateCriteria``).
 11. It gains more than its permutations: ``permutation_test.run_permutation_test`` (``PermutationCriteria``).
 12. A further cause explains at least half of the remaining misfit: ``search.search`` (``SearchCriteria``).
-13. It survives backward elimination: ``backward_elimination.replace_by_implied``, ``backward_elimination.drop_redundant``
+13. It survives backward elimination: ``backward_elimination.replace_by_implied``,
+``backward_elimination.drop_redundant``
     (``CandidateCriteria``, ``SearchCriteria``).
 14. All causes together explain enough of the misfit, otherwise all are dropped: ``search.search``
     (``SearchCriteria``, ``AdequacyCriteria``).

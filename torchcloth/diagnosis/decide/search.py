@@ -1,4 +1,4 @@
-"""Stepwise search for causes: screen, fit the likeliest anew, compare on motions held out, accept, and again."""
+"""Stepwise search for causes: score tests, fits of the most likely hypotheses, comparison on held-out motions."""
 
 from __future__ import annotations
 
@@ -6,11 +6,11 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
-from ...episodes.world import Hypothesis, Model
-from ...episodes.world_cache import if_possible
-from ..data.dataset import Progress, DiagnosisData, prefix_progress
-from ..data.replicate_floor import ReplicateFloor, find_replicate_pairs, estimate_replicate_floor
-from ..inference.bifurcations import find_bifurcating_bins, drop_bins
+from ...episodes.world import Hypothesis, WorldModel
+from ...episodes.world_cache import none_if_impossible
+from ..data.dataset import DiagnosisData, Progress, prefix_progress
+from ..data.replicate_floor import ReplicateFloor, estimate_replicate_floor, find_replicate_pairs
+from ..inference.bifurcations import drop_bins, find_bifurcating_bins
 from ..inference.comparison import Gain, HeldOutPrediction, compare, list_observed_motions, predict_held_out
 from ..inference.confounding import find_confounded
 from ..inference.fitting import ModelFit, fit, put_on_common_noise
@@ -18,297 +18,401 @@ from ..inference.heterogeneity import propose_from_heterogeneity
 from ..inference.lack_of_fit import has_lack_of_fit
 from ..inference.noise import compute_noise_floor, minimal_noise
 from ..inference.prior_restarts import propose_from_prior, refit_from_prior
-from ..inference.screening import MUCH, ScoreTest, screen
+from ..inference.screening import ScoreTest, screen
 from ..inference.warm_start import quadratic_warm_start
-from .backward_elimination import fraction_explained, replace_by_implied, predictive_gain, drop_redundant, supported_only_by_misfit_motions
-from .candidates import (
-    FEWEST,
-    FURTHER,
-    SURELY,
-    TRIED,
-    WORTH_PULL,
-    Candidate,
-    AcceptedCause,
-    sole_informative_motions,
-    propose_candidates,
-    far_from_sheet,
-    evaluate_candidates,
-    worsens,
+from .backward_elimination import (
+    drop_redundant,
+    fraction_explained,
+    predictive_gain,
+    replace_by_implied,
+    supported_only_by_misfit_motions,
 )
-
-MOST = 4  # causes
-FAR = 10.0  # log density that a further step should gain, from which all causes are fitted on together
-LEAST = 1 / 3  # of what is wrong, that all causes explain beside something else
-FAINT = 0.08  # of what could be explained, where nothing is lacking
-HALF = 0.5  # the same of a further cause, and of what only motions tell that do not fit; of what is gained, a law more
+from .candidates import (
+    AcceptedCause,
+    Candidate,
+    contradicts_data_sheet,
+    evaluate_candidates,
+    propose_candidates,
+    sole_informative_motions,
+    worsens_positions,
+)
+from .criteria import CRITERIA
 
 
 class SearchPath(NamedTuple):
-    """Causes one after the other."""
+    """Causes that were accepted one after the other.
 
-    fit: ModelFit  # with all of them
+    Attributes:
+        fit: the model with all of them.
+        accepted: the causes.
+        data: the episodes without bins that respond discontinuously with them.
+    """
+
+    fit: ModelFit
     accepted: list[AcceptedCause]
-    data: DiagnosisData  # without the cells that jump with them
+    data: DiagnosisData
 
 
 @dataclass(frozen=True, eq=False)
 class SearchResult:
-    """The end of a search."""
+    """Result of a search.
+
+    Attributes:
+        start: fit of the base model.
+        end: fit with all causes.
+        accepted: the causes, those that are too small to be relevant among them.
+        scores: score tests at the end.
+        held_out: predictions of held-out motions by the model at the start and at the end.
+        total_gain: gain of all causes together; None without causes.
+        noise_floor: RMS of a position bin [m]: of repetitions if there are any, else of the sensor.
+        sensor_floor: RMS of a position bin by sensor noise and slow errors [m].
+        replicate_floor: noise floor by repetitions; None if no episode repeats another.
+        data: the episodes without bins that respond discontinuously.
+        withdrawn: causes that were accepted, and that a law without a cause outperforms.
+        not_simulated: hypotheses that could not be simulated with the fitted model.
+    """
 
     start: ModelFit
     end: ModelFit
     accepted: list[AcceptedCause]
-    scores: list[ScoreTest]  # at the end
-    held_out: tuple[HeldOutPrediction, HeldOutPrediction]  # by the model at the start and at the end
-    total_gain: Gain | None  # of all causes together
-    noise_floor: float  # m, of a cell: what repetitions differ by, else what the sensor does
-    sensor_floor: float  # m, of a cell: noise and slow errors
-    replicate_floor: ReplicateFloor | None  # None: no episode repeats another
-    data: DiagnosisData  # without the cells that jump between shapes
-    withdrawn: tuple[str, ...] = ()  # causes that were accepted, and that a law without a cause does more than
-    not_simulated: tuple[str, ...] = ()  # what was asked about and cannot be simulated beside the fitted model
+    scores: list[ScoreTest]
+    held_out: tuple[HeldOutPrediction, HeldOutPrediction]
+    total_gain: Gain | None
+    noise_floor: float
+    sensor_floor: float
+    replicate_floor: ReplicateFloor | None
+    data: DiagnosisData
+    withdrawn: tuple[str, ...] = ()
+    not_simulated: tuple[str, ...] = ()
 
     @property
     def causes(self) -> list[AcceptedCause]:
-        """Those that are large enough to matter; the others stay in the model, so that nothing stands in for them.
+        """Causes that are large enough to be named (gate 16).
 
-        Of what cannot be told apart, by predictions or by slopes, one must matter, and the others be half as large as
-        is of interest.
+        The others stay in the model, so that nothing takes their place. Of confounded hypotheses one must be relevant,
+        and all others at least half as large as the smallest amplitude of interest.
         """
-        large = lambda told: any(h.matters(a) for h, a in told) and all(h.might_matter(a) for h, a in told)  # noqa: E731
-        return [s for s in self.accepted if large(self.equivalents(s))]
+
+        def is_relevant(pairs: list[tuple[Hypothesis, float]]) -> bool:
+            return any(h.is_relevant(a) for h, a in pairs) and all(h.is_possibly_relevant(a) for h, a in pairs)
+
+        return [cause for cause in self.accepted if is_relevant(self.equivalents(cause))]
 
     @property
     def minor(self) -> list[AcceptedCause]:
-        """Those that stay in the model without a name: they, or what predicts as well, are too small to matter."""
+        """Causes in the model without a name: they, or hypotheses that predict as well, are too small."""
         named = self.causes
-        return [s for s in self.accepted if s not in named]
+        return [cause for cause in self.accepted if cause not in named]
 
-    def rivals(self, step: AcceptedCause) -> list[Candidate]:
-        """A step's rivals in the end; none is what joined the model beside its cause."""
-        there = {s.candidate.hypothesis.name for s in self.accepted}
-        return [c for c in step.rivals if c.hypothesis.name not in there]
+    def rivals(self, cause: AcceptedCause) -> list[Candidate]:
+        """Return a cause's rivals at the end; a rival that joined the model is none any more."""
+        names = {other.candidate.hypothesis.name for other in self.accepted}
+        return [c for c in cause.rivals if c.hypothesis.name not in names]
 
-    def confounded_scores(self, step: AcceptedCause) -> list[ScoreTest]:
-        """What slopes cannot tell from a step's cause, where predictions did not and the model has it not."""
-        h = step.candidate.hypothesis
-        beaten = {c.hypothesis.name for c in step.tried} - {c.hypothesis.name for c in step.rivals}
-        apart = beaten | {s.candidate.hypothesis.name for s in self.accepted} - {h.name}
-        others = [r for r in step.scores if r.chi2 > 0 and r.hypothesis.name not in apart]
-        return find_confounded(step.fit_before, step.candidate.score, self.amplitude(step), others)
+    def confounded_scores(self, cause: AcceptedCause) -> list[ScoreTest]:
+        """Return hypotheses that are confounded with a cause, linearised.
 
-    def equivalents(self, step: AcceptedCause) -> list[tuple[Hypothesis, float]]:
-        """A step's cause in the end, its rivals and what slopes cannot tell from it, with amplitudes.
-
-        Less what is the same by structure, whose amplitude tells nothing more.
+        Hypotheses that predictions distinguish from it, or that are in the model, are left out.
         """
-        h, rivals = step.candidate.hypothesis, [(c.hypothesis, c.amplitude) for c in self.rivals(step)]
-        said = {*h.structurally_equivalent, *(other.name for other, _ in rivals)}
-        unseen = [(r.hypothesis, r.amplitude) for r in self.confounded_scores(step) if r.hypothesis.name not in said]
-        return [(h, self.amplitude(step)), *rivals, *unseen]
+        h = cause.candidate.hypothesis
+        beaten = {c.hypothesis.name for c in cause.tried} - {c.hypothesis.name for c in cause.rivals}
+        distinguished = beaten | {other.candidate.hypothesis.name for other in self.accepted} - {h.name}
+        others = [s for s in cause.scores if s.chi2 > 0 and s.hypothesis.name not in distinguished]
+        return find_confounded(cause.fit_before, cause.candidate.score, self.amplitude(cause), others)
 
-    def amplitude(self, step: AcceptedCause) -> float:
-        """Of a step's cause in the end."""
-        return self.end.model.amplitudes[self.end.model.place(step.candidate.hypothesis.name)]
+    def equivalents(self, cause: AcceptedCause) -> list[tuple[Hypothesis, float]]:
+        """Return a cause at the end, its rivals and hypotheses that are confounded with it, with amplitudes.
+
+        Structurally equivalent hypotheses are left out, because their amplitude says nothing more.
+        """
+        h, rivals = cause.candidate.hypothesis, [(c.hypothesis, c.amplitude) for c in self.rivals(cause)]
+        listed = {*h.structurally_equivalent, *(rival.name for rival, _ in rivals)}
+        confounded = [(s.hypothesis, s.amplitude) for s in self.confounded_scores(cause)]
+        return [(h, self.amplitude(cause)), *rivals, *((c, a) for c, a in confounded if c.name not in listed)]
+
+    def amplitude(self, cause: AcceptedCause) -> float:
+        """Return a cause's amplitude at the end, in the hypothesis's unit."""
+        return self.end.model.amplitudes[self.end.model.index_of(cause.candidate.hypothesis.name)]
 
     @property
     def bifurcating_fraction(self) -> float:
-        """Share of the cells that jump."""
-        jumping = sum(map(len, self.data.bifurcating_bins or ()))
-        return jumping / (jumping + len(self.end.whitened.value))
+        """Fraction of the bins that respond discontinuously."""
+        count = sum(map(len, self.data.bifurcating_bins or ()))
+        return count / (count + len(self.end.whitened.value))
 
 
 def search(
-    model: Model, setting: DiagnosisData, hypotheses: Sequence[Hypothesis], progress: Progress = lambda _: None
+    model: WorldModel, data: DiagnosisData, hypotheses: Sequence[Hypothesis], progress: Progress = lambda _: None
 ) -> SearchResult:
-    """Causes one after the other, until none is both present and useful on motions held out."""
-    hypotheses = model.others(hypotheses)
-    near, before = quadratic_warm_start(model, setting, prefix_progress(progress, "from the data sheet"))
-    start = fit(near, setting, hypotheses, progress=prefix_progress(progress, "base model"), before=before)
-    jumping = find_bifurcating_bins(start, setting, prefix_progress(progress, "folds that turn over"))
-    if any(map(len, jumping)):
-        setting, start = setting.without_bins(jumping), drop_bins(start, jumping)
-    current, steps, left = _chain(start, setting, hypotheses, progress, TRIED)
-    if not steps:
-        current, steps, left = _anew(start, setting, hypotheses, progress)
-    if not steps:
-        current, steps, left = _of_disputed(start, setting, hypotheses, progress)
-    impossible = (*_impossible(start, hypotheses), *(_impossible(current, hypotheses) if steps else ()))
-    return replace(_found(start, current, steps, left), impossible=tuple(dict.fromkeys(impossible)))
+    """Accept causes one after the other until no candidate may be named.
 
+    If none may be named, the search starts again from the data sheet, then from parameters about which motions
+    disagree.
 
-def _impossible(found: ModelFit, hypotheses: Sequence[Hypothesis]) -> list[str]:
-    """What was asked about and could not be simulated beside the model."""
-    able = {h.name for h in found.linearisation.hypotheses}
-    return [h.name for h in found.model.others(hypotheses) if h.name not in able]
-
-
-def _anew(start: ModelFit, setting: DiagnosisData, hypotheses: Sequence[Hypothesis], progress: Progress) -> SearchPath:
-    """As ``_chain``, with a first cause that is begun at the data sheet.
-
-    Where nothing is lacking any more, it must surely gain what nulls' causes do not.
+    Args:
+        model: the base model at the data sheet.
+        data: the episodes.
+        hypotheses: what is asked about.
+        progress: called with one line for each episode that is simulated.
     """
-    lacking = has_lack_of_fit(start, setting.motions)
-    if not lacking and len(set(list_observed_motions(start.whitened.episode, setting.motions))) < FEWEST:
-        return SearchPath(start, [], setting)
-    screened = screen(start)
-    rows = {row.hypothesis.name: row for row in screened}
-    asked = [row.hypothesis for row in screened if row.visibility]
-    least = 0.0 if lacking else MUCH
-    likely = if_possible(lambda: propose_from_prior(start, setting, asked, TRIED, progress, least)) or []
-    first = evaluate_candidates(start, setting, [(rows[h.name], model) for h, model in likely], screened, progress)
-    if first is None or not (lacking or first.candidate.gain.lower_bound_95 > SURELY):
-        return SearchPath(start, [], setting)
-    return _chain(start, setting, hypotheses, progress, TRIED, first)
+    hypotheses = model.not_accepted(hypotheses)
+    near, before = quadratic_warm_start(model, data, prefix_progress(progress, "from the data sheet"))
+    start = fit(near, data, hypotheses, progress=prefix_progress(progress, "base model"), before=before)
+    keys = find_bifurcating_bins(start, data, prefix_progress(progress, "bifurcating bins"))
+    if any(map(len, keys)):
+        data, start = data.without_bins(keys), drop_bins(start, keys)
+    path = _search_stepwise(start, data, hypotheses, progress, CRITERIA.candidate.max_tried)
+    if not path.accepted:
+        path = _search_from_prior(start, data, hypotheses, progress)
+    if not path.accepted:
+        path = _search_heterogeneous(start, data, hypotheses, progress)
+    not_simulated = [*_list_not_simulated(start, hypotheses)]
+    not_simulated += _list_not_simulated(path.fit, hypotheses) if path.accepted else []
+    return replace(_summarise(start, path), not_simulated=tuple(dict.fromkeys(not_simulated)))
 
 
-def _of_disputed(start: ModelFit, setting: DiagnosisData, hypotheses: Sequence[Hypothesis], progress: Progress) -> SearchPath:
-    """As ``_chain``, with a first cause of a law about whose number motions disagree."""
-    begun, screened = propose_from_heterogeneity(start, setting.motions, hypotheses), screen(start)
-    rows = {row.hypothesis.name: row for row in screened if row.visibility}
-    likely = [(rows[h.name], model) for h, model in begun if h.name in rows]
-    first = evaluate_candidates(start, setting, likely, screened, prefix_progress(progress, "disputed"), ()) if likely else None
-    return SearchPath(start, [], setting) if first is None else _chain(start, setting, hypotheses, progress, TRIED, first)
+def _list_not_simulated(fitted: ModelFit, hypotheses: Sequence[Hypothesis]) -> list[str]:
+    """Return the hypotheses that were asked about and could not be simulated with the model."""
+    simulated = {h.name for h in fitted.linearisation.hypotheses}
+    return [h.name for h in fitted.model.not_accepted(hypotheses) if h.name not in simulated]
+
+
+def _search_from_prior(
+    start: ModelFit, data: DiagnosisData, hypotheses: Sequence[Hypothesis], progress: Progress
+) -> SearchPath:
+    """Search with a first cause that starts from the data sheet.
+
+    If the base model has no lack of fit, the cause must surely gain what no cause of a null case does.
+    """
+    criteria = CRITERIA.candidate
+    is_inadequate = has_lack_of_fit(start, data.motions)
+    n_motions = len(set(list_observed_motions(start.whitened.episode, data.motions)))
+    if not is_inadequate and n_motions < criteria.min_motions:
+        return SearchPath(start, [], data)
+    scores = screen(start)
+    by_name = {score.hypothesis.name: score for score in scores}
+    visible = [score.hypothesis for score in scores if score.visibility]
+    min_gain = 0.0 if is_inadequate else CRITERIA.screening.min_expected_gain
+    likely = none_if_impossible(
+        lambda: propose_from_prior(start, data, visible, criteria.max_tried, progress, min_gain)
+    )
+    proposed = [(by_name[h.name], model) for h, model in likely or []]
+    first = evaluate_candidates(start, data, proposed, scores, progress)
+    if first is None or not (is_inadequate or first.candidate.gain.lower_bound_95 > criteria.certain_gain):
+        return SearchPath(start, [], data)
+    return _search_stepwise(start, data, hypotheses, progress, criteria.max_tried, first)
+
+
+def _search_heterogeneous(
+    start: ModelFit, data: DiagnosisData, hypotheses: Sequence[Hypothesis], progress: Progress
+) -> SearchPath:
+    """Search with a first cause that changes a law about whose parameter motions disagree."""
+    starts, scores = propose_from_heterogeneity(start, data.motions, hypotheses), screen(start)
+    by_name = {score.hypothesis.name: score for score in scores if score.visibility}
+    proposed = [(by_name[h.name], model) for h, model in starts if h.name in by_name]
+    if not proposed:
+        return SearchPath(start, [], data)
+    first = evaluate_candidates(start, data, proposed, scores, prefix_progress(progress, "motions disagree"), ())
+    if first is None:
+        return SearchPath(start, [], data)
+    return _search_stepwise(start, data, hypotheses, progress, CRITERIA.candidate.max_tried, first)
 
 
 def extend_search(
     start: ModelFit,
-    setting: DiagnosisData,
+    data: DiagnosisData,
     hypotheses: Sequence[Hypothesis],
     progress: Progress = lambda _: None,
-    tried: int = TRIED,
+    max_tried: int = CRITERIA.candidate.max_tried,
 ) -> SearchResult:
-    """As ``search``, from a fit that was asked about the hypotheses, until nothing is lacking any more.
-
-    Each step fits the ``tried`` likeliest anew.
-    """
-    sound = lambda found: not has_lack_of_fit(found, setting.motions)  # noqa: E731
-    return _found(start, *_chain(start, setting, hypotheses, progress, tried, enough=sound))
-
-
-def replace_by_law(found: SearchResult, laws: ModelFit, tried: int, progress: Progress = lambda _: None) -> SearchResult:
-    """The same without its causes where one of the laws alone does clearly more than all of them together.
+    """Continue a search from a fit until no lack of fit is left.
 
     Args:
-        found: a search with causes.
-        laws: where it started, asked about laws that are no causes.
-        tried: of them that are fitted anew.
+        start: fit that was linearised along the hypotheses.
+        data: the episodes.
+        hypotheses: what is asked about.
+        progress: called with one line for each episode that is simulated.
+        max_tried: candidates that are fitted at each step.
+    """
+
+    def is_adequate(fitted: ModelFit) -> bool:
+        return not has_lack_of_fit(fitted, data.motions)
+
+    return _summarise(start, _search_stepwise(start, data, hypotheses, progress, max_tried, is_enough=is_adequate))
+
+
+def replace_by_law(
+    result: SearchResult, laws: ModelFit, max_tried: int, progress: Progress = lambda _: None
+) -> SearchResult:
+    """Drop all causes if one law alone predicts clearly better than all of them together (gate 15).
+
+    Args:
+        result: a search with causes.
+        laws: fit at its start, linearised along laws that are no causes.
+        max_tried: laws that are fitted.
         progress: called with one line for each episode that is simulated.
     """
-    if found.total_gain is None:
-        return found
-    screened, names, gained = screen(laws), found.data.motions, found.total_gain.log_density
-    promising = [row for row in screened if row.expected_gain > gained]
-    step = evaluate_candidates(laws, found.data, propose_candidates(laws, promising, tried), screened, progress)
-    if step is None:
-        return found
-    alone = sole_informative_motions(found.accepted)
-    law, end = (predict_held_out(f, names, alone) for f in put_on_common_noise(step.candidate.fit, found.end))
+    if result.total_gain is None:
+        return result
+    scores, data, total = screen(laws), result.data, result.total_gain.log_density
+    proposed = propose_candidates(laws, [score for score in scores if score.expected_gain > total], max_tried)
+    best = evaluate_candidates(laws, data, proposed, scores, progress)
+    if best is None:
+        return result
+    sole = sole_informative_motions(result.accepted)
+    law, end = (
+        predict_held_out(fitted, data.motions, sole) for fitted in put_on_common_noise(best.candidate.fit, result.end)
+    )
     over = compare(end, law, 0.0)
-    if over.lower_bound_95 < 0 or over.log_density < HALF * gained:
-        return found
-    withdrawn = tuple(s.candidate.hypothesis.name for s in found.causes)
-    none = _found(found.start, found.start, [], found.data)
-    return replace(none, withdrawn=withdrawn, impossible=found.not_simulated)
+    if over.lower_bound_95 < 0 or over.log_density < CRITERIA.search.min_relative_gain_of_law * total:
+        return result
+    withdrawn = tuple(cause.candidate.hypothesis.name for cause in result.causes)
+    none = _summarise(result.start, SearchPath(result.start, [], data))
+    return replace(none, withdrawn=withdrawn, not_simulated=result.not_simulated)
 
 
-def _chain(
+def _search_stepwise(
     start: ModelFit,
-    setting: DiagnosisData,
+    data: DiagnosisData,
     hypotheses: Sequence[Hypothesis],
     progress: Progress,
-    tried: int,
+    max_tried: int,
     first: AcceptedCause | None = None,
-    enough: Callable[[ModelFit], bool] = lambda _: False,
+    is_enough: Callable[[ModelFit], bool] = lambda _: False,
 ) -> SearchPath:
-    """The model with all causes, after ``first`` if known, until it is ``enough``."""
-    nothing = SearchPath(start, [], setting)
+    """Accept causes one after the other, after ``first`` if given, until none may be named or the model is enough."""
+    criteria, no_causes = CRITERIA.search, SearchPath(start, [], data)
 
-    def asked(found: ModelFit, progress: Progress) -> ModelFit:
-        left = found.model.others(hypotheses)
-        return fit(found.model, setting, left, 0, progress, before=start.linearisation, here=found.linearisation)
+    def linearise_others(fitted: ModelFit, stage: Progress) -> ModelFit:
+        others = fitted.model.not_accepted(hypotheses)
+        return fit(fitted.model, data, others, 0, stage, before=start.linearisation, here=fitted.linearisation)
 
-    current, steps, step = start, [], first
-    while len(steps) < MOST:
-        if step is None:
-            other = refit_from_prior(current, setting, hypotheses, progress) if steps and current.model.strained else None
-            if other is not None and predictive_gain(other, current, setting.motions) > 0:
-                current, other = other, None
-            screened = screen(current)
-            begun = propose_candidates(current, screened, tried)
-            begun += [] if other is None else propose_candidates(other, screen(other), tried)
-            more = propose_candidates(current, screened, tried, after=tried)
-            step = evaluate_candidates(current, setting, begun, screened, progress, more)
-        if step is None:
+    current, accepted, cause = start, [], first
+    while len(accepted) < criteria.max_causes:
+        if cause is None:
+            # A parameter that made up for a cause before it was known is fitted again from its data sheet.
+            refitted = None
+            if accepted and current.model.strained_parameters:
+                refitted = refit_from_prior(current, data, hypotheses, progress)
+            if refitted is not None and predictive_gain(refitted, current, data.motions) > 0:
+                current, refitted = refitted, None
+            scores = screen(current)
+            proposed = propose_candidates(current, scores, max_tried)
+            proposed += [] if refitted is None else propose_candidates(refitted, screen(refitted), max_tried)
+            more = propose_candidates(current, scores, max_tried, skip=max_tried)
+            cause = evaluate_candidates(current, data, proposed, scores, progress, more)
+        if cause is None:
             break
-        best, before, cells = step.candidate.fit, current, (start, setting)
-        now = prefix_progress(progress, f"with {step.candidate.hypothesis.name}")
-        current = fit(best.model, setting, (), FURTHER, now, before=start.linearisation, here=best.linearisation)
-        if has_lack_of_fit(current, setting.motions):
-            start, current, setting = _still(start, current, setting, now)
-        if steps and fraction_explained(before, current, setting.motions, sole_informative_motions([*steps, step])) < HALF:
-            current, (start, setting) = before, cells
+
+        # All coordinates are fitted with the new cause. Bins that respond discontinuously with it are dropped.
+        best, before, state = cause.candidate.fit, current, (start, data)
+        stage = prefix_progress(progress, f"with {cause.candidate.hypothesis.name}")
+        current = fit(
+            best.model,
+            data,
+            (),
+            CRITERIA.candidate.further_iterations,
+            stage,
+            before=start.linearisation,
+            here=best.linearisation,
+        )
+        if has_lack_of_fit(current, data.motions):
+            start, current, data = _drop_new_bifurcations(start, current, data, stage)
+
+        # Gate 12: a further cause explains enough of what the others left.
+        sole = sole_informative_motions([*accepted, cause])
+        min_fraction = criteria.min_fraction_of_further_cause
+        if accepted and fraction_explained(before, current, data.motions, sole) < min_fraction:
+            current, (start, data) = before, state
             break
-        steps, step = [*steps, step], None
-        if enough(current):
+        accepted, cause = [*accepted, cause], None
+        if is_enough(current):
             break
-        current = asked(current, now)
-    current, steps = replace_by_implied(current, steps, setting, hypotheses, progress)
-    current, steps = drop_redundant(current, steps, setting, hypotheses, progress)
-    if steps and current.expected_gain > FAR:
-        here, now = current.linearisation, prefix_progress(progress, "all")
-        current = fit(current.model, setting, progress=now, before=here, here=here)
-        current = current if enough(current) else asked(current, now)
-        current, steps = drop_redundant(current, steps, setting, hypotheses, progress)
-    share = fraction_explained(start, current, setting.motions, sole_informative_motions(steps)) if steps else 1.0
-    little = share < LEAST or (share < HALF and supported_only_by_misfit_motions(start, current, steps, setting.motions))
-    far = any(far_from_sheet(step.candidate, step.candidate.gain) for step in steps)
-    if little or (steps and not far and _idle(_of_all(start, current, steps, setting), start, steps, setting)):
-        return nothing
-    return SearchPath(current, steps, setting)
+        current = linearise_others(current, stage)
+
+    # Gate 13: backward elimination, and a fit of all causes together if it promises much.
+    current, accepted = replace_by_implied(current, accepted, data, hypotheses, progress)
+    current, accepted = drop_redundant(current, accepted, data, hypotheses, progress)
+    if accepted and current.expected_gain > criteria.min_refit_gain:
+        here, stage = current.linearisation, prefix_progress(progress, "all")
+        current = fit(current.model, data, progress=stage, before=here, here=here)
+        current = current if is_enough(current) else linearise_others(current, stage)
+        current, accepted = drop_redundant(current, accepted, data, hypotheses, progress)
+
+    # Gate 14: all causes together explain enough of the misfit.
+    if not accepted:
+        return SearchPath(current, accepted, data)
+    fraction = fraction_explained(start, current, data.motions, sole_informative_motions(accepted))
+    if fraction < criteria.min_fraction_explained:
+        return no_causes
+    if fraction < criteria.min_fraction_without_support and supported_only_by_misfit_motions(
+        start, current, accepted, data.motions
+    ):
+        return no_causes
+    contradicts = any(contradicts_data_sheet(c.candidate, c.candidate.gain) for c in accepted)
+    if not contradicts and _is_idle(_compute_total_gain(start, current, accepted, data), start, accepted, data):
+        return no_causes
+    return SearchPath(current, accepted, data)
 
 
-def _still(start: ModelFit, current: ModelFit, setting: DiagnosisData, progress: Progress) -> tuple[ModelFit, ModelFit, DiagnosisData]:
-    """Less the cells that jump with the causes in the model, where they are all that is lacking.
+def _drop_new_bifurcations(
+    start: ModelFit, current: ModelFit, data: DiagnosisData, progress: Progress
+) -> tuple[ModelFit, ModelFit, DiagnosisData]:
+    """Drop bins that respond discontinuously with the causes in the model, if they alone cause the lack of fit.
 
-    Slack that a loose grip leaves buckles to either side.
+    For example, slack that a slipping grip leaves buckles to either side.
     """
-    more = find_bifurcating_bins(current, setting, prefix_progress(progress, "folds that turn over"))
-    if not any(map(len, more)) or has_lack_of_fit(still := drop_bins(current, more), setting.motions):
-        return start, current, setting
-    return drop_bins(start, more), still, setting.without_bins(more)
+    keys = find_bifurcating_bins(current, data, prefix_progress(progress, "bifurcating bins"))
+    if not any(map(len, keys)) or has_lack_of_fit(remaining := drop_bins(current, keys), data.motions):
+        return start, current, data
+    return drop_bins(start, keys), remaining, data.without_bins(keys)
 
 
-def _of_all(start: ModelFit, current: ModelFit, steps: list[AcceptedCause], setting: DiagnosisData) -> Gain:
-    """What all causes together gain."""
-    return compare(*_held_out(start, current, steps, setting), compute_noise_floor(current.linearisation, minimal_noise()))
+def _compute_total_gain(start: ModelFit, current: ModelFit, accepted: list[AcceptedCause], data: DiagnosisData) -> Gain:
+    floor = compute_noise_floor(current.linearisation, minimal_noise())
+    return compare(*_predict_start_and_end(start, current, accepted, data), floor)
 
 
-def _idle(whole: Gain, start: ModelFit, steps: list[AcceptedCause], setting: DiagnosisData) -> bool:
-    """Positions are predicted worse, or hardly better where nothing was lacking, and pulls hardly better.
+def _is_idle(total: Gain, start: ModelFit, accepted: list[AcceptedCause], data: DiagnosisData) -> bool:
+    """Whether positions are predicted worse, or hardly better where the base model was adequate, and so are forces.
 
-    Hardly better is enough of what a number of the fabric, which is back with its data sheet, did until then.
+    Hardly better suffices if a parameter of the fabric returns to its data sheet.
     """
-    if worsens(whole):
+    if worsens_positions(total):
         return True
-    faint = whole.explained_fraction < FAINT and whole.rms_removed[1] < WORTH_PULL
-    return faint and not any(s.candidate.restores_prior for s in steps) and not has_lack_of_fit(start, setting.motions)
+    has_small_gain = (
+        total.explained_fraction < CRITERIA.search.min_fraction_if_adequate
+        and total.rms_removed[1] < CRITERIA.candidate.min_force_n
+    )
+    restores_prior = any(cause.candidate.restores_prior for cause in accepted)
+    return has_small_gain and not restores_prior and not has_lack_of_fit(start, data.motions)
 
 
-def _held_out(start: ModelFit, current: ModelFit, steps: list[AcceptedCause], setting: DiagnosisData) -> tuple[HeldOutPrediction, HeldOutPrediction]:
-    """By the model without its causes and with them."""
+def _predict_start_and_end(
+    start: ModelFit, current: ModelFit, accepted: list[AcceptedCause], data: DiagnosisData
+) -> tuple[HeldOutPrediction, HeldOutPrediction]:
     first, last = put_on_common_noise(start, current)
-    held_out = lambda found: predict_held_out(found, setting.motions, sole_informative_motions(steps))  # noqa: E731
-    return held_out(first), held_out(last)
+    sole = sole_informative_motions(accepted)
+    return predict_held_out(first, data.motions, sole), predict_held_out(last, data.motions, sole)
 
 
-def _found(start: ModelFit, current: ModelFit, steps: list[AcceptedCause], setting: DiagnosisData) -> SearchResult:
-    screened = screen(current)
-    alone = sole_informative_motions(steps)
-    last = predict_held_out(current, setting.motions, alone)
-    sensor = compute_noise_floor(current.linearisation, minimal_noise())  # slow errors that were fitted may be the model's own
-    repeated = estimate_replicate_floor(last, find_replicate_pairs(setting.recordings, setting.episodes))
-    floor = sensor if repeated is None else repeated.rms
-    held_out = _held_out(start, current, steps, setting)
-    whole = compare(*held_out, floor) if steps else None
-    return SearchResult(start, current, steps, screened, held_out, whole, floor, sensor, repeated, setting)
+def _summarise(start: ModelFit, path: SearchPath) -> SearchResult:
+    current, accepted, data = path
+    last = predict_held_out(current, data.motions, sole_informative_motions(accepted))
+    # slow errors that were fitted may be the model's own, so the floor has the smallest ones
+    sensor_floor = compute_noise_floor(current.linearisation, minimal_noise())
+    replicate_floor = estimate_replicate_floor(last, find_replicate_pairs(data.recordings, data.episodes))
+    noise_floor = sensor_floor if replicate_floor is None else replicate_floor.rms
+    held_out = _predict_start_and_end(start, current, accepted, data)
+    return SearchResult(
+        start=start,
+        end=current,
+        accepted=accepted,
+        scores=screen(current),
+        held_out=held_out,
+        total_gain=compare(*held_out, noise_floor) if accepted else None,
+        noise_floor=noise_floor,
+        sensor_floor=sensor_floor,
+        replicate_floor=replicate_floor,
+        data=data,
+    )

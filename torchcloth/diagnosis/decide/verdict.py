@@ -1,4 +1,4 @@
-"""From a search to an answer in words and numbers."""
+"""Verdict of a search, and the content of diagnosis.json."""
 
 from __future__ import annotations
 
@@ -11,46 +11,53 @@ import torch
 from scipy.special import chdtrc, stdtrit
 from torch import Tensor
 
-from ...episodes.world import Hypothesis, Model
+from ..._utils.constants import Z_95
+from ...episodes.world import Hypothesis, WorldModel
 from ...errors import InvalidInput
-from ...identification.result import or_none
+from ...identification.result import nan_to_none
 from ...recordings import Recording
-from ..causes.glossary import meaning
+from ..causes.glossary import describe
 from ..data.data_checks import Fault
-from ..inference.comparison import Gain, compare_by_motion, list_observed_motions, jackknife, count_effective_motions
+from ..inference.comparison import (
+    Gain,
+    compare_by_motion,
+    count_effective_motions,
+    jackknife,
+    list_observed_motions,
+)
 from ..inference.confounding import are_fits_confounded
 from ..inference.force_drift import estimate_force_drifts
 from ..inference.lack_of_fit import measure_lack_of_fit
 from ..report.cloud_overlays import CloudOverlay
-from ..report.wording import write_sentences, collect_warnings
+from ..report.wording import collect_warnings, write_sentences
 from ..unknown.localisation import localise_cause
 from ..unknown.missing_force import MissingForce
 from ..unknown.residual_force import ResidualForceFit
-from .candidates import NORMAL, AcceptedCause, between_motions
+from .candidates import AcceptedCause, look_up_t_quantile
+from .criteria import CRITERIA
 from .search import SearchResult
 
-COMMON = 0.03  # of a number, standard deviation: what is wrong in all motions alike, by sealed answers
-NUDGE = 1e-4  # of a coordinate, for its value's slope
-DISAGREE, TWO = 0.005, 2.0  # chance below which motions disagree about a number; as many must tell of it
+SCHEMA = "torchcloth.diagnosis/1"
+COORDINATE_NUDGE = 1e-4  # of a parameter's coordinate, for the slope of its value
 
 Verdict = Literal["identified", "ambiguous", "unexplained", "adequate", "inconclusive", "numerics", "invalid_data"]
 
 
 @dataclass(frozen=True, eq=False)
 class Diagnosis:
-    """What the simulation gets wrong.
+    """Result of ``diagnose``.
 
     Attributes:
-        verdict: "identified" (each cause stands alone), "ambiguous" (some cannot be told from others), "unexplained"
-            (the fit is lacking and nothing known mends it), "adequate" (no known cause is surely larger than what
-            matters), "inconclusive" (these data cannot say), "numerics" (another mesh changes more than a cause
-            would), "invalid_data" (an episode cannot be believed, and nothing was simulated).
-        content: all of it, as diagnosis.json has it.
-        searched: the search; None of invalid data.
-        missing: the force that is missing, where the fit is lacking.
-        residual: laws of a force that were learned, where the fit is lacking or no cause is named.
-        overlays: a moment of each episode, for pictures; none, where nobody simulated them.
-        experiment: the one that is proposed as an episode, with blanks for what will be seen and felt.
+        verdict: "identified" (each cause stands alone), "ambiguous" (some causes are confounded with others),
+            "unexplained" (a lack of fit that no known cause explains), "adequate" (no known cause is surely relevant),
+            "inconclusive" (these data cannot say), "numerics" (another mesh changes more than a cause would),
+            "invalid_data" (an episode cannot be used, and nothing was simulated).
+        content: the content of diagnosis.json.
+        optional_search: the search; None of invalid data.
+        missing_force: the force that is missing; None without a lack of fit.
+        residual_force: local force laws that were learned; None if there is a cause and no lack of fit.
+        overlays: one moment of each episode, for figures; empty if nobody simulated them.
+        experiment: the proposed experiment as an episode without measurements.
     """
 
     verdict: Verdict
@@ -63,233 +70,296 @@ class Diagnosis:
 
     @property
     def search(self) -> SearchResult:
-        """The search, for pictures and for those who want to know.
+        """The search.
 
         Raises:
             InvalidInput: the data were invalid.
         """
         if self.optional_search is None:
-            raise InvalidInput("found", got="a diagnosis of invalid data", expected="episodes that can be believed")
+            raise InvalidInput("search", got="a diagnosis of invalid data", expected="episodes that can be used")
         return self.optional_search
 
     @property
-    def model(self) -> Model:
-        """The base model with its fitted parameters and the accepted causes; raises as ``found``."""
+    def model(self) -> WorldModel:
+        """The base model with its fitted parameters and the accepted causes; raises as ``search``."""
         return self.search.end.model
 
     def summary(self) -> str:
-        """Plain language."""
+        """Return the result in plain language, one sentence a line."""
         return "\n".join(write_sentences(self.verdict, self.content))
 
 
 def judge(
-    found: SearchResult, names: Sequence[str], missing: MissingForce | None = None, residual: ResidualForceFit | None = None
+    result: SearchResult,
+    motions: Sequence[str],
+    missing_force: MissingForce | None = None,
+    residual_force: ResidualForceFit | None = None,
 ) -> Diagnosis:
-    """The answer of a search over episodes with these motions, and of what was learned beyond it."""
-    causes = [_cause(found, step, names) for step in found.causes]
-    minor = [_minor(found, step) for step in found.minor]
-    told = {name for m in minor for name in (m["effect"], *(r["effect"] for r in m["rivals"]))}
-    told |= {name for c in causes for name in (*c["class"], *(r["effect"] for r in c["rivals"]))}
-    rows = [r for r in found.scores if r.hypothesis.name not in told]
-    left, drifting = measure_lack_of_fit(found.end, names), estimate_force_drifts(found.end, names)
-    learned = residual is not None and bool(residual.search.causes)
-    lacking = learned or bool(found.withdrawn) or any(row.is_significant for row in (*left, *drifting))
-    lacking = lacking or any(c["motions_disagree"] for c in causes)
-    doubtful = [r["effect"] for m in minor for r in m["rivals"]]
-    stable = all(row.meshes_agree for row in left)
-    verdict = _verdict(found, causes, lacking, stable, bool(doubtful or found.end.model.strained))
+    """Derive the verdict of a search and the content of diagnosis.json.
+
+    Args:
+        result: the search.
+        motions: label of each episode.
+        missing_force: the force that is missing, if it was estimated.
+        residual_force: local force laws, if they were learned.
+    """
+    causes = [_describe_cause(result, cause, motions) for cause in result.causes]
+    minor = [_describe_minor(result, cause) for cause in result.minor]
+    mentioned = {name for m in minor for name in (m["effect"], *(r["effect"] for r in m["rivals"]))}
+    mentioned |= {name for c in causes for name in (*c["equivalence_class"], *(r["effect"] for r in c["rivals"]))}
+    scores = [score for score in result.scores if score.hypothesis.name not in mentioned]
+
+    # the model lacks something if the residuals say so, if laws without a cause predict better, or if motions disagree
+    rows, drifts = measure_lack_of_fit(result.end, motions), estimate_force_drifts(result.end, motions)
+    has_laws = residual_force is not None and bool(residual_force.search.causes)
+    is_inadequate = has_laws or bool(result.withdrawn) or any(row.is_significant for row in (*rows, *drifts))
+    is_inadequate = is_inadequate or any(c["motions_disagree"] for c in causes)
+
+    relevant_rivals = [r["effect"] for m in minor for r in m["rivals"]]
+    is_doubtful = bool(relevant_rivals or result.end.model.strained_parameters)
+    meshes_agree = all(row.meshes_agree for row in rows)
+    verdict = _decide(result, causes, is_inadequate, meshes_agree, is_doubtful)
     content = {
+        "schema": SCHEMA,
         "verdict": verdict,
         "causes": causes,
-        "given": _given(found, names),
+        "initial_causes": _describe_initial_causes(result, motions),
         "minor": minor,
-        "ruled_out": [r.hypothesis.name for r in rows if r.decision == "absent"],
-        "wrong_sign": [r.hypothesis.name for r in rows if r.has_wrong_sign],
-        "undecided": [*doubtful, *(r.hypothesis.name for r in rows if r.decision in ("inconclusive", "present"))],
-        "unresolvable": [
-            {"effect": r.hypothesis.name, "smallest_detectable": _finite(r.smallest_detectable), "unit": r.hypothesis.unit}
-            for r in rows
-            if r.decision == "unresolvable"
+        "ruled_out": [s.hypothesis.name for s in scores if s.decision == "absent"],
+        "wrong_sign": [s.hypothesis.name for s in scores if s.has_wrong_sign],
+        "undecided": [
+            *relevant_rivals,
+            *(s.hypothesis.name for s in scores if s.decision in ("inconclusive", "present")),
         ],
-        "gain": _gain(found, names) if causes else None,
-        "also_unexplained": bool(causes) and lacking,
-        "floor": _floor(found),
-        "lack_of_fit": [row.as_dict() for row in left],
-        "drifts": [row.as_dict() for row in drifting],
-        "missing_force": None if missing is None else missing.as_dict(),
-        "residual": None if residual is None else residual.as_dict(),
+        "unresolvable": [
+            {
+                "effect": s.hypothesis.name,
+                "smallest_detectable": s.smallest_detectable if s.smallest_detectable < math.inf else None,
+                "unit": s.hypothesis.unit,
+            }
+            for s in scores
+            if s.decision == "unresolvable"
+        ],
+        "gain": _describe_gain(result, motions) if causes else None,
+        "also_unexplained": bool(causes) and is_inadequate,
+        "noise_floor": _describe_noise_floor(result),
+        "lack_of_fit": [row.as_dict() for row in rows],
+        "force_drifts": [drift.as_dict() for drift in drifts],
+        "missing_force": None if missing_force is None else missing_force.as_dict(),
+        "residual_force": None if residual_force is None else residual_force.as_dict(),
         "next_experiment": None,
-        "parameters": _parameters(found, names),
-        "common_error": COMMON,
-        "warnings": collect_warnings(found, names, left),
-        "motions": list(names),
+        "parameters": _describe_parameters(result, motions),
+        "common_relative_error": CRITERIA.report.common_relative_error,
+        "warnings": collect_warnings(result, motions, rows),
+        "motions": list(motions),
     }
-    return Diagnosis(verdict, content, found, missing, residual)
+    return Diagnosis(verdict, content, result, missing_force, residual_force)
 
 
-def refuse(faults: Sequence[Fault], names: Sequence[str] = ()) -> Diagnosis:
-    """The answer where episodes cannot be believed: what is wrong with them."""
-    keys = "causes given minor ruled_out wrong_sign undecided unresolvable lack_of_fit drifts warnings"
-    lists: dict[str, Any] = {key: [] for key in keys.split()}
-    none = dict.fromkeys(("gain", "missing_force", "residual", "next_experiment", "model", "plan_hash"))
-    said = [{"episode": f.episode, "what": f.what, "remedy": f.remedy} for f in faults]
-    content = {**lists, **none, "verdict": "invalid_data", "also_unexplained": False, "parameters": {}}
-    return Diagnosis("invalid_data", {**content, "faults": said, "motions": list(names)}, None)
+def refuse(faults: Sequence[Fault], motions: Sequence[str] = ()) -> Diagnosis:
+    """Return the result for episodes that cannot be used: their faults.
+
+    Args:
+        faults: what makes the episodes unusable.
+        motions: label of each episode.
+    """
+    lists = (
+        "causes", "initial_causes", "minor", "ruled_out", "wrong_sign", "undecided", "unresolvable", "lack_of_fit",
+        "force_drifts", "warnings",
+    )  # fmt: skip
+    optional = ("gain", "missing_force", "residual_force", "next_experiment", "model", "plan_hash")
+    content = {
+        "schema": SCHEMA,
+        **{key: [] for key in lists},
+        **dict.fromkeys(optional),
+        "verdict": "invalid_data",
+        "also_unexplained": False,
+        "parameters": {},
+        "faults": [{"episode": f.episode, "what": f.what, "remedy": f.remedy} for f in faults],
+        "motions": list(motions),
+    }
+    return Diagnosis("invalid_data", content, None)
 
 
-def _verdict(found: SearchResult, causes: Sequence[dict[str, Any]], lacking: bool, stable: bool, doubtful: bool) -> Verdict:
+def _decide(
+    result: SearchResult,
+    causes: Sequence[dict[str, Any]],
+    is_inadequate: bool,
+    meshes_agree: bool,
+    is_doubtful: bool,
+) -> Verdict:
     if causes:
-        return "identified" if all(not c["rivals"] and len(c["class"]) == 1 for c in causes) else "ambiguous"
-    if lacking:
+        stand_alone = all(not c["rivals"] and len(c["equivalence_class"]) == 1 for c in causes)
+        return "identified" if stand_alone else "ambiguous"
+    if is_inadequate:
         return "unexplained"
-    if not stable:
+    if not meshes_agree:
         return "numerics"
-    undecided = [r for r in found.scores if r.decision == "present"]
-    return "inconclusive" if undecided or doubtful else "adequate"
+    is_undecided = any(score.decision == "present" for score in result.scores)
+    return "inconclusive" if is_undecided or is_doubtful else "adequate"
 
 
-def _minor(found: SearchResult, step: AcceptedCause) -> dict[str, Any]:
-    """What is too small to matter, and what cannot be told from it and would matter."""
-    alike = found.equivalents(step)
-    small = next(pair for pair in alike if not pair[0].is_relevant(pair[1]))
-    return {**_told(*small), "rivals": [_told(h, a) for h, a in alike if h.is_relevant(a)]}
+def _describe_minor(result: SearchResult, cause: AcceptedCause) -> dict[str, Any]:
+    """Return what is too small to be relevant, and what is confounded with it and would be relevant."""
+    pairs = result.equivalents(cause)
+    small = next((h, a) for h, a in pairs if not h.is_relevant(a))
+    return {**_describe_amplitude(*small), "rivals": [_describe_amplitude(h, a) for h, a in pairs if h.is_relevant(a)]}
 
 
-def _told(hypothesis: Hypothesis, amplitude: float) -> dict[str, Any]:
+def _describe_amplitude(hypothesis: Hypothesis, amplitude: float) -> dict[str, Any]:
     return {"effect": hypothesis.name, "amplitude": amplitude, "unit": hypothesis.unit}
 
 
-def _given(found: SearchResult, names: Sequence[str]) -> list[dict[str, Any]]:
-    """Causes that the model came with, fitted anew."""
-    model, first = found.end.model, len(found.end.model.parameters)
-    given = found.start.model.accepted
-    std = _errors(found, names).tolist() if given else []
-    out = []
-    for h in given:
-        place = model.place(h.name)
-        amplitude = model.amplitudes[place]
-        error = NORMAL * _with_common(std[first + place], amplitude)
-        out.append({**_told(h, amplitude), "ci95": [amplitude - error, amplitude + error]})
-    return out
+def _describe_initial_causes(result: SearchResult, motions: Sequence[str]) -> list[dict[str, Any]]:
+    """Return the causes of the model that the search started with, fitted again."""
+    model, n_parameters = result.end.model, len(result.end.model.parameters)
+    initial = result.start.model.accepted
+    std = _coordinate_errors(result, motions).tolist() if initial else []
+    rows = []
+    for h in initial:
+        index = model.index_of(h.name)
+        amplitude = model.amplitudes[index]
+        half_width = Z_95 * _add_common_error(std[n_parameters + index], amplitude)
+        rows.append({**_describe_amplitude(h, amplitude), "ci95": [amplitude - half_width, amplitude + half_width]})
+    return rows
 
 
-def _cause(found: SearchResult, step: AcceptedCause, names: Sequence[str]) -> dict[str, Any]:
-    best, h, count = step.candidate, step.candidate.hypothesis, len(found.end.model.parameters)
-    place, amplitude = found.end.model.place(h.name), found.amplitude(step)
-    noise, std, told = _error(found, count + place, names, best.sole_informative_motion)
-    noise, std = (math.hypot(error, best.score.mesh_bias) for error in (noise, std))
-    std = _with_common(std, amplitude)
-    kin = [r.hypothesis.name for r in found.confounded_scores(step)]
-    rivals = found.rivals(step)
-    kin += [c.hypothesis.name for c in rivals if are_fits_confounded(best.fit, c.fit, step.noise)]
+def _describe_cause(result: SearchResult, cause: AcceptedCause, motions: Sequence[str]) -> dict[str, Any]:
+    candidate, h, n_parameters = cause.candidate, cause.candidate.hypothesis, len(result.end.model.parameters)
+    index, amplitude = result.end.model.index_of(h.name), result.amplitude(cause)
+    coordinate = n_parameters + index
+    noise_std, std, effective = _amplitude_errors(result, coordinate, motions, candidate.sole_informative_motion)
+    noise_std, std = (math.hypot(error, candidate.score.mesh_bias) for error in (noise_std, std))
+    std = _add_common_error(std, amplitude)
+    rivals = result.rivals(cause)
+    confounded = [score.hypothesis.name for score in result.confounded_scores(cause)]
+    confounded += [c.hypothesis.name for c in rivals if are_fits_confounded(candidate.fit, c.fit, cause.noise)]
+    test = cause.permutation_test
     return {
-        **_told(h, amplitude),
-        "ci95": [amplitude - NORMAL * std, amplitude + NORMAL * std],
-        "noise_ci95": [amplitude - NORMAL * noise, amplitude + NORMAL * noise],
-        "told_by": told,
-        "motions_disagree": _disagreed(found, count + place, told, names),
+        **_describe_amplitude(h, amplitude),
+        "ci95": [amplitude - Z_95 * std, amplitude + Z_95 * std],
+        "noise_ci95": [amplitude - Z_95 * noise_std, amplitude + Z_95 * noise_std],
+        "effective_motions": effective,
+        "motions_disagree": _do_motions_disagree(result, coordinate, effective, motions),
         "typical": h.typical,
-        "says": meaning(h),
-        "class": sorted({h.name, *kin, *h.structurally_equivalent}),
-        "rivals": [_told(c.hypothesis, c.amplitude) for c in rivals],
-        "gain_mm": 1e3 * (best.gain.rms_before - best.gain.rms_after),
-        "placebo": {"log_density": step.permutation_test.gain, "chance": step.permutation_test.quantile_95 or None},
-        "share_of_explainable": _share(found, best.gain),
-        **localise_cause(found.end, h.name, names, found.data.episodes),
+        "description": describe(h),
+        "equivalence_class": sorted({h.name, *confounded, *h.structurally_equivalent}),
+        "rivals": [_describe_amplitude(c.hypothesis, c.amplitude) for c in rivals],
+        "rms_removed_mm": 1e3 * (candidate.gain.rms_before - candidate.gain.rms_after),
+        "permutation_test": {"log_density": test.gain, "quantile_95": test.quantile_95 or None},
+        "explained_fraction": _fraction_of_cause(result, candidate.gain),
+        **localise_cause(result.end, h.name, motions, result.data.episodes),
     }
 
 
-def _errors(found: SearchResult, names: Sequence[str]) -> Tensor:
-    """[P + A] standard errors of the model's coordinates: the wider of what noise allows and motions disagree by.
+def _coordinate_errors(result: SearchResult, motions: Sequence[str]) -> Tensor:
+    """Return [P + A] standard errors of the coordinates: the larger of those by noise and by disagreement of motions.
 
-    Few motions know little of what they disagree by: NORMAL of these errors is as wide as Student's interval.
+    Few motions say little about how much they disagree, so the latter are widened: ``Z_95`` of them is as wide as
+    Student's interval.
     """
-    own = found.end.covariance.diagonal().sqrt()
-    wider = between_motions(list_observed_motions(found.end.whitened.episode, names)) / NORMAL
-    return torch.maximum(own, wider * jackknife(found.end, names)[1]) if wider < math.inf else own
+    noise_std = result.end.covariance.diagonal().sqrt()
+    factor = look_up_t_quantile(list_observed_motions(result.end.whitened.episode, motions)) / Z_95
+    if not factor < math.inf:
+        return noise_std
+    return torch.maximum(noise_std, factor * jackknife(result.end, motions)[1])
 
 
-def _error(found: SearchResult, place: int, names: Sequence[str], alone: Collection[str]) -> tuple[float, float, float]:
-    """Of one coordinate: (standard error by noise alone, as ``_errors``, how many motions tell of it).
+def _amplitude_errors(
+    result: SearchResult, coordinate: int, motions: Sequence[str], sole: Collection[str]
+) -> tuple[float, float, float]:
+    """Return (standard error by noise, the larger of it and that of motions, effective number of motions).
 
-    Where hardly more than one does, little is known of what motions disagree by.
+    If hardly more than one motion informs, little is known about how much motions disagree.
     """
-    own = float(found.end.covariance[place, place]) ** 0.5
-    motions, count = (count_effective_motions(found.end, place, names, halved) for halved in ((), alone))
-    if count <= 1.0:
-        return own, own, motions
-    wider = float(stdtrit(max(count - 1.0, 1.0), 0.975)) / NORMAL
-    return own, max(own, wider * float(jackknife(found.end, names, alone)[1][place])), motions
+    noise_std = float(result.end.covariance[coordinate, coordinate]) ** 0.5
+    effective, effective_folds = (
+        count_effective_motions(result.end, coordinate, motions, halved) for halved in ((), sole)
+    )
+    if effective_folds <= 1.0:
+        return noise_std, noise_std, effective
+    factor = float(stdtrit(max(effective_folds - 1.0, 1.0), 0.975)) / Z_95
+    motion_std = float(jackknife(result.end, motions, sole)[1][coordinate])
+    return noise_std, max(noise_std, factor * motion_std), effective
 
 
-def _disagreed(found: SearchResult, place: int, told: float, names: Sequence[str]) -> bool:
-    """Motions differ about a number by more than noise makes them: what it stands for is not quite what happens.
+def _do_motions_disagree(result: SearchResult, coordinate: int, effective: float, motions: Sequence[str]) -> bool:
+    """Whether motions differ about an amplitude by more than noise: then the cause is not quite what happens.
 
-    Cochran's Q: ``told`` - 1 times the ratio of the two variances, against chi^2 of as many degrees of freedom.
+    Cochran's Q is the effective number of motions less one, times the ratio of the two variances. It is compared with a
+    chi-squared distribution with as many degrees of freedom.
     """
-    if told < TWO:
+    criteria = CRITERIA.heterogeneity
+    if effective < criteria.min_effective_motions:
         return False
-    ratio = float(jackknife(found.end, names)[1].square()[place] / found.end.covariance[place, place])
-    return bool(chdtrc(told - 1.0, (told - 1.0) * ratio) < DISAGREE)
+    motion_variance = jackknife(result.end, motions)[1].square()[coordinate]
+    ratio = float(motion_variance / result.end.covariance[coordinate, coordinate])
+    return bool(chdtrc(effective - 1.0, (effective - 1.0) * ratio) < criteria.max_p_value)
 
 
-def _with_common(std: float, number: float) -> float:
-    return math.hypot(std, COMMON * number)
+def _add_common_error(std: float, value: float) -> float:
+    return math.hypot(std, CRITERIA.report.common_relative_error * value)
 
 
-def _share(found: SearchResult, gain: Gain) -> float | None:
-    """Of what all causes explain together, by what each adds to the predictive density."""
-    every = sum(max(0.0, step.candidate.gain.log_density) for step in found.accepted)
-    if found.total_gain is None or not every:
+def _fraction_of_cause(result: SearchResult, gain: Gain) -> float | None:
+    """Return the part of the explained fraction of all causes that is due to one, by its gain in log density."""
+    total = sum(max(0.0, cause.candidate.gain.log_density) for cause in result.accepted)
+    if result.total_gain is None or not total:
         return None
-    return max(0.0, found.total_gain.explained_fraction) * max(0.0, gain.log_density) / every
+    return max(0.0, result.total_gain.explained_fraction) * max(0.0, gain.log_density) / total
 
 
-def _gain(found: SearchResult, names: Sequence[str]) -> dict[str, Any] | None:
-    if found.total_gain is None:
+def _describe_gain(result: SearchResult, motions: Sequence[str]) -> dict[str, Any] | None:
+    if result.total_gain is None:
         return None
-    g, motions = found.total_gain, compare_by_motion(*found.held_out, found.noise_floor, names)
-    return {
-        "rms_before": g.rms_before,
-        "rms_after": g.rms_after,
-        "floor": found.noise_floor,
-        "unit": "m",
-        "explained_fraction": g.explained_fraction,
-        "ci95": list(g.explained_fraction_ci95),
-        "log_density": g.log_density,
-        "log_density_ci95": list(g.log_density_ci95),
-        "per_motion": [
+    total, by_motion = result.total_gain, compare_by_motion(*result.held_out, result.noise_floor, motions)
+    rows = []
+    for motion, g in by_motion.items():
+        has_positions, has_interval = not math.isnan(g.rms_before), g.lower_bound_95 > -math.inf
+        rows.append(
             {
-                "motion": name,
-                "rms_before": or_none(m.rms_before),
-                "rms_after": or_none(m.rms_after),
-                "explained_fraction": None if math.isnan(m.rms_before) else m.explained_fraction,
-                "ci95": None if math.isnan(m.rms_before) or m.lower_bound_95 == -math.inf else list(m.explained_fraction_ci95),
-                "log_density": m.log_density,
-                "log_density_ci95": None if m.lower_bound_95 == -math.inf else list(m.log_density_ci95),
+                "motion": motion,
+                "rms_before": nan_to_none(g.rms_before),
+                "rms_after": nan_to_none(g.rms_after),
+                "explained_fraction": g.explained_fraction if has_positions else None,
+                "explained_fraction_ci95": list(g.explained_fraction_ci95) if has_positions and has_interval else None,
+                "log_density": g.log_density,
+                "log_density_ci95": list(g.log_density_ci95) if has_interval else None,
             }
-            for name, m in motions.items()
-        ],
+        )
+    return {
+        "rms_before": total.rms_before,
+        "rms_after": total.rms_after,
+        "noise_floor": result.noise_floor,
+        "unit": "m",
+        "explained_fraction": total.explained_fraction,
+        "explained_fraction_ci95": list(total.explained_fraction_ci95),
+        "log_density": total.log_density,
+        "log_density_ci95": list(total.log_density_ci95),
+        "per_motion": rows,
     }
 
 
-def _floor(found: SearchResult) -> dict[str, Any]:
-    """What a true model would leave of a cell, and where that is known from."""
-    out: dict[str, Any] = {"value": found.noise_floor, "sensor": found.sensor_floor, "unit": "m", "left_out": found.bifurcating_fraction}
-    if found.replicate_floor is None:
-        return {**out, "source": "sensor only", "pairs": 0}
-    return {**out, "source": "repetitions", "pairs": found.replicate_floor.pairs}
+def _describe_noise_floor(result: SearchResult) -> dict[str, Any]:
+    """Return what a correct model would leave of a bin, and the source of that number."""
+    floor = result.replicate_floor
+    return {
+        "value": result.noise_floor,
+        "sensor": result.sensor_floor,
+        "unit": "m",
+        "bifurcating_fraction": result.bifurcating_fraction,
+        "source": "sensor only" if floor is None else "repetitions",
+        "pairs": 0 if floor is None else floor.pairs,
+    }
 
 
-def _parameters(found: SearchResult, names: Sequence[str]) -> dict[str, Any]:
-    model, out = found.end.model, {}
-    for p, c, s in zip(model.parameters, model.values.tolist(), _errors(found, names).tolist(), strict=False):
-        value, slope = p.value(c), (p.value(c + NUDGE) - p.value(c - NUDGE)) / (2 * NUDGE)
-        wide = NORMAL * _with_common(s, value / slope)
-        ends = (p.value(min(max(end, p.low), p.high)) for end in (c - wide, c + wide))
+def _describe_parameters(result: SearchResult, motions: Sequence[str]) -> dict[str, Any]:
+    model, out = result.end.model, {}
+    errors = _coordinate_errors(result, motions).tolist()
+    for p, c, std in zip(model.parameters, model.coordinates.tolist(), errors, strict=False):
+        value = p.value(c)
+        slope = (p.value(c + COORDINATE_NUDGE) - p.value(c - COORDINATE_NUDGE)) / (2 * COORDINATE_NUDGE)
+        half_width = Z_95 * _add_common_error(std, value / slope)
+        ends = (p.value(min(max(end, p.min_coordinate), p.max_coordinate)) for end in (c - half_width, c + half_width))
         out[p.name] = {"value": value, "ci95": sorted(ends), "unit": p.unit, "data_sheet": p.value(0.0)}
     return out
-
-
-def _finite(value: float) -> float | None:
-    return value if value < float("inf") else None

@@ -1,4 +1,4 @@
-"""What the arms that the episodes name can do of the experiments, and an experiment as a folder to drive them by."""
+"""Experiments that the arms of the episodes can carry out, and a proposed experiment as an episode on disk."""
 
 from __future__ import annotations
 
@@ -10,85 +10,99 @@ from pathlib import Path
 
 from ...errors import TorchclothError
 from ...recordings import Recording, write
-from ...recordings.templates import is_undone, undone
-from ...robots import JointPlan, to_gripper_motion, replan_episode  # pyright: ignore[reportMissingImports] - mapped from robots/
+from ...recordings.templates import as_template, is_template
+from ...robots import (  # pyright: ignore[reportMissingImports] - mapped from robots/ at installation
+    JointPlan,
+    replan_episode,
+    to_gripper_motion,
+)
 from ...robots.replan_episode import scene_from_episode  # pyright: ignore[reportMissingImports]
 from ..data.dataset import Progress
 from ..inference.episode_simulation import map_parallel
-from .motions import Experiment, blank_frames, blank_readings, planned, possible
+from .motions import Experiment, add_blank_readings, list_experiments, make_blank_frames, make_episode
 
-FOLDER = "next_experiment"  # beside diagnosis.json
-PROPOSED = "synthetic: an experiment that torchcloth diagnose proposes"
+EXPERIMENT_FOLDER = "next_experiment"  # beside diagnosis.json
+PROPOSAL_PROVENANCE = "synthetic: an experiment that torchcloth diagnose proposes"
 
 
 @dataclass(frozen=True, eq=False)
-class Choice:
-    """An experiment as fast as it can be done.
+class FeasibleExperiment:
+    """An experiment as fast as the arms can do it.
 
     Attributes:
         experiment: at a speed that the arms can do.
-        episode: it, with what is not known yet left blank.
-        plan: of the arms; None where no arm was asked.
-        why_not: what is in the arms' way; None: nothing.
-        unasked: why arms that are named could not be asked; None: they were, or none are.
+        episode: the experiment as an episode without measurements.
+        plan: motion of the arms; None if no arm was checked.
+        why_not: why the arms cannot do it; None: they can.
+        not_checked: why arms could not be checked; None: they were, or the episodes name none.
     """
 
     experiment: Experiment
     episode: Recording
     plan: JointPlan | None = None
     why_not: str | None = None
-    unasked: str | None = None
+    not_checked: str | None = None
 
 
-def feasible(recordings: Sequence[Recording], progress: Progress) -> list[Choice]:
-    """All experiments that may be asked for, with what the arms can do about them."""
+def check_feasibility(recordings: Sequence[Recording], progress: Progress) -> list[FeasibleExperiment]:
+    """Return all experiments that the recordings allow, with what the arms can do.
 
-    def ask(choice: tuple[Experiment, Recording]) -> Choice:
+    Args:
+        recordings: the episodes.
+        progress: called with one line for each experiment that arms are checked for.
+    """
+
+    def check(choice: tuple[Experiment, Recording]) -> FeasibleExperiment:
         experiment, template = choice
-        episode = planned(experiment, template)
+        episode = make_episode(experiment, template)
         try:
             scene = scene_from_episode(episode)
         except TorchclothError as error:
-            return Choice(experiment, episode, unasked=str(error))
+            return FeasibleExperiment(experiment, episode, not_checked=str(error))
         if scene is None:
-            return Choice(experiment, episode)
-        if bare := [name for name in scene.arms if scene[name].links_without_primitives]:
-            return Choice(experiment, episode, unasked=f"solids of {bare[0]!r} are meshes, which cannot be kept apart")
+            return FeasibleExperiment(experiment, episode)
+        if without_primitives := [name for name in scene.arms if scene[name].links_without_primitives]:
+            reason = f"solids of {without_primitives[0]!r} are meshes, for which collisions are not checked"
+            return FeasibleExperiment(experiment, episode, not_checked=reason)
         progress(f"{experiment}: whether the arms can do it")
         try:
             plan = replan_episode(episode, scene)
         except TorchclothError as error:
             progress(f"{experiment}: the arms cannot do it: {error}")
-            return Choice(experiment, episode, why_not=str(error))
+            return FeasibleExperiment(experiment, episode, why_not=str(error))
         slower = replace(experiment, speed=experiment.speed / plan.slower)
         paths = {name: to_gripper_motion(path) for name, path in plan.motion(scene).items()}
-        grippers = {name: blank_readings(path, episode.grippers[name]) for name, path in paths.items()}
-        done = replace(
+        grippers = {name: add_blank_readings(path, episode.grippers[name]) for name, path in paths.items()}
+        planned = replace(
             episode,
             grippers=grippers,
             joints=plan.joints(),
-            points=blank_frames(episode, float(plan.t[-1])),
+            points=make_blank_frames(episode, float(plan.t[-1])),
             split={"motion": str(slower)},
         )
-        return Choice(slower, done, plan)
+        return FeasibleExperiment(slower, planned, plan)
 
-    return map_parallel(ask, possible(recordings))
+    return map_parallel(check, list_experiments(recordings))
 
 
 def write_episode(episode: Recording | None, folder: Path) -> str | None:
-    """An experiment that nobody has done yet as an episode beside diagnosis.json: paths, joints, the first shape.
+    """Write a proposed experiment as an episode beside diagnosis.json: paths, joints, the initial shape.
 
-    It takes the place of an earlier diagnosis's; None takes that away. What was recorded there stays.
+    It replaces the proposal of an earlier diagnosis; None removes that. A folder with measurements stays.
+
+    Args:
+        episode: the experiment, or None.
+        folder: folder of the diagnosis.
 
     Returns:
-        A warning, or None; a proposal that cannot be written is no reason to lose a diagnosis.
+        A warning, or None. A proposal that cannot be written is no reason to lose a diagnosis.
     """
-    target = folder / FOLDER
+    target = folder / EXPERIMENT_FOLDER
     try:
-        if os.path.lexists(target) and not is_undone(target, PROPOSED):
+        if os.path.lexists(target) and not is_template(target, PROPOSAL_PROVENANCE):
             return f"{target} is no proposal, or holds more than one, and was left as it is"
         if episode is not None:
-            write(undone(episode, PROPOSED), target, overwrite=True)
+            write(as_template(episode, PROPOSAL_PROVENANCE), target, overwrite=True)
         elif target.exists():
             shutil.rmtree(target)
     except (TorchclothError, OSError) as error:

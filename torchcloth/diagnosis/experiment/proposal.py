@@ -1,13 +1,14 @@
-"""Which experiment would tell causes apart, or show one that cannot be seen yet.
+"""Choice of the experiment that best distinguishes causes, or shows one that is not detectable yet.
 
-With V the information on causes that is left beside everything that is fitted anyway,
+With the information V on causes that is left beyond everything that is fitted anyway,
 
     D_ij = a_i^2 V_ii (1 - rho_ij^2 - h)
 
-is the chi^2 by which cause i at amplitude a_i is told from j at its best amplitude, beyond the share h by which two
-engines may differ (``trials.HARDLY``). An experiment adds its own slopes, as the present model has them, to those of
-the data (T-optimal design, linearised: Chen and Asprey 2003), as noisy as a right model would be there: ripples tell
-little. Of all experiments the one is proposed whose smallest D over the pairs is largest.
+is the chi-squared that distinguishes cause i at amplitude a_i from cause j at its best amplitude, beyond the fraction h
+by which two simulators may differ (``CandidateCriteria.simulator_tolerance``). An experiment adds its own slopes, as
+the present model has them, to those of the data (T-optimal design, linearised: Chen and Asprey 2003). Its noise is that
+of a correct model, in which ripples carry little information. The experiment whose smallest D over the pairs is largest
+is proposed.
 """
 
 from __future__ import annotations
@@ -23,36 +24,34 @@ from torch import Tensor
 
 from ...episodes.observed import Episode, build_episode
 from ...episodes.replay import Frames
-from ...episodes.steps import both_ways
-from ...episodes.world_cache import Worlds
+from ...episodes.steps import central_steps
+from ...episodes.world_cache import WorldCache
 from ...errors import InvalidInput, TorchclothError
 from ...recordings import Recording
-from ..data.binning import bin_residuals, finite_differences, concatenate_directions
-from ..data.dataset import Progress, DiagnosisData, extend_for_clock, drop_unsimulated_frames
-from ..decide.candidates import HARDLY
+from ..data.binning import bin_residuals, concatenate_directions, finite_differences
+from ..data.dataset import DiagnosisData, Progress, drop_unsimulated_frames, extend_for_clock
+from ..decide.criteria import CRITERIA
 from ..decide.search import SearchResult
-from ..inference.episode_simulation import differentiate_nuisances, run_episode, map_parallel
+from ..inference.episode_simulation import differentiate_nuisances, map_parallel, run_episode
 from ..inference.fitting import ModelFit, prior_precision
 from ..inference.lack_of_fit import reference_noise
 from ..inference.linearise import central_differences
 from ..inference.noise import Noise
-from .feasibility import Choice, feasible
+from .feasibility import FeasibleExperiment, check_feasibility
 from .motions import Experiment
 
-NEEDED = (1.64 + 0.84) ** 2  # chi^2: told apart in 80 % of cases at 5 %
-MOST_REPEATS = 10
-MANY = 6  # causes that cannot be decided yet, the likeliest
-POINTS = 250  # of a frame, where the data do not say
+DEFAULT_POINTS_PER_FRAME = 250  # if the data have no points
+DEFAULT_POINT_NOISE_M = 1e-3  # if the data do not state it
 
 
 @dataclass(frozen=True)
-class Question:
-    """What is to be told.
+class OpenQuestion:
+    """Question that an experiment should answer.
 
     Attributes:
         fitted: a model with slopes along all the causes.
-        amplitudes: of the causes by name.
-        pairs: of causes to be told apart; none: each is to be seen at all.
+        amplitudes: amplitude of each cause by name.
+        pairs: pairs of causes to distinguish; empty: each cause is to be detected at all.
     """
 
     fitted: ModelFit
@@ -60,213 +59,275 @@ class Question:
     pairs: tuple[tuple[str, str], ...] = ()
 
     @cached_property
-    def worlds(self) -> Worlds:
-        """Of the model and beside it, for all experiments."""
-        return Worlds(self.fitted.model, both_ways(self.fitted.model))
+    def worlds(self) -> WorldCache:
+        """Worlds of the model and of shifted points, for all experiments."""
+        return WorldCache(self.fitted.model, central_steps(self.fitted.model))
 
 
 class Proposal(NamedTuple):
-    """An experiment that tells most."""
+    """The most informative experiment.
 
-    content: dict[str, Any]  # ``next_experiment`` of diagnosis.json
-    episode: Recording  # it, with blanks for what will be seen and felt
+    Attributes:
+        content: ``next_experiment`` of diagnosis.json.
+        episode: the experiment as an episode without measurements.
+    """
+
+    content: dict[str, Any]
+    episode: Recording
 
 
-def propose(found: SearchResult, content: Mapping[str, Any], setting: DiagnosisData, progress: Progress) -> Proposal | None:
-    """Of what the arms can do, the experiment that tells most; None: nothing is open, or nothing tells of it."""
-    question = question_of(found, content)
+def propose_experiment(
+    result: SearchResult, content: Mapping[str, Any], data: DiagnosisData, progress: Progress
+) -> Proposal | None:
+    """Propose the most informative experiment that the arms can do.
+
+    Args:
+        result: the search.
+        content: the content of diagnosis.json so far.
+        data: the episodes.
+        progress: called with one line for each experiment.
+
+    Returns:
+        The proposal; None if nothing is open, or if no experiment informs about it.
+    """
+    question = find_open_question(result, content)
     if question is None:
         return None
     names = list(question.amplitudes)
-    now = distances(question, information(question, []))
+    now = compute_chi2(question, compute_information(question, []))
 
-    def ask(choice: Choice) -> tuple[Choice, Tensor] | None:
+    def simulate(choice: FeasibleExperiment) -> tuple[FeasibleExperiment, Tensor] | None:
         progress(str(choice.experiment))
         try:
-            return choice, whitened_slopes(question, replace(choice.episode, joints={}), setting)
+            return choice, simulate_whitened_slopes(question, replace(choice.episode, joints={}), data)
         except (TorchclothError, torch.linalg.LinAlgError):  # pyright: ignore[reportPrivateImportUsage]
-            return None  # it cannot be simulated, so it says nothing
+            return None  # an experiment that cannot be simulated says nothing
 
-    choices = feasible(setting.recordings, progress)
+    choices = check_feasibility(data.recordings, progress)
     refused = {str(c.experiment): c.why_not for c in choices if c.why_not is not None}
-    tried = [answer for answer in map_parallel(ask, [c for c in choices if not c.why_not]) if answer is not None]
-    if not tried:
+    answers = map_parallel(simulate, [c for c in choices if not c.why_not])
+    simulated = [answer for answer in answers if answer is not None]
+    if not simulated:
         return None
-    told = [distances(question, information(question, [slopes])) for _, slopes in tried]
-    best = max(range(len(tried)), key=lambda k: _worth(told[k], question))
-    if max(told[best].values()) <= 0:
+    chi2 = [compute_chi2(question, compute_information(question, [slopes])) for _, slopes in simulated]
+    order = sorted(range(len(simulated)), key=lambda k: _rate(chi2[k], question))
+    best, median = max(range(len(simulated)), key=lambda k: _rate(chi2[k], question)), order[len(order) // 2]
+    if max(chi2[best].values()) <= 0:
         return None
-    middle = sorted(range(len(tried)), key=lambda k: _worth(told[k], question))[len(tried) // 2]
-    choice, slopes = tried[best]
+    choice, slopes = simulated[best]
     experiment = choice.experiment
-    repeats = _repeats(question, slopes)
-    said = {
+    repetitions = _count_repetitions(question, slopes)
+    description = {
         "motion": experiment.motion,
         "heading": experiment.heading,
         "speed": experiment.speed,
         "separates": [list(pair) for pair in question.pairs],
-        "shows": [] if question.pairs else names,
-        "expected_d": _weakest(told[best]),
-        "d_now": _weakest(now),
-        "median": {"experiment": str(tried[middle][0].experiment), "expected_d": _weakest(told[middle])},
-        "repeats": repeats,
-        "arms": _arms(choice, refused),
-        "why": _why(experiment, question, now, told[best], _weakest(told[middle]), repeats),
+        "detects": [] if question.pairs else names,
+        "expected_chi2": min(chi2[best].values()),
+        "current_chi2": min(now.values()),
+        "median": {
+            "experiment": str(simulated[median][0].experiment),
+            "expected_chi2": min(chi2[median].values()),
+        },
+        "repetitions": repetitions,
+        "arms": _describe_arms(choice, refused),
+        "why": _explain(experiment, question, now, chi2[best], min(chi2[median].values()), repetitions),
     }
-    return Proposal(said, choice.episode)
+    return Proposal(description, choice.episode)
 
 
-def _arms(choice: Choice, refused: Mapping[str, str]) -> dict[str, Any] | None:
-    """What the arms make of it; None where none are named."""
+def _describe_arms(choice: FeasibleExperiment, refused: Mapping[str, str]) -> dict[str, Any] | None:
+    """Return what the arms can do; None if the episodes name none."""
     if choice.plan is not None:
-        return {"slower": choice.plan.slowdown, "limit": choice.plan.limiting_joint, "refused": refused}
-    return None if choice.unasked is None else {"unasked": choice.unasked}
+        return {"slowdown": choice.plan.slower, "limited_by": choice.plan.limiting, "refused": refused}
+    return None if choice.not_checked is None else {"not_checked": choice.not_checked}
 
 
-def question_of(found: SearchResult, content: Mapping[str, Any]) -> Question | None:
-    """What a search leaves open: causes that have rivals, else causes that are not decided.
+def find_open_question(result: SearchResult, content: Mapping[str, Any]) -> OpenQuestion | None:
+    """Return what a search leaves open: causes with rivals, else hypotheses that are not decided.
 
-    ``content`` holds what was said of causes, and of what is too small to matter: that may have rivals that would.
+    Args:
+        result: the search.
+        content: descriptions of causes and of what is too small to be relevant, which may have relevant rivals.
     """
-    said = [*content["causes"], *content["minor"]]
-    fitted = {p.name for p in found.end.model.parameters}  # what does the same as one of them, no experiment shows
-    for step, cause in zip([*found.causes, *found.minor], said, strict=True):
-        known = {h.name for h in step.fit_before.linearisation.hypotheses if h.equivalent_parameter not in fitted}
-        open_to = known & {cause["effect"], *(r["effect"] for r in cause["rivals"])}
-        amplitudes = {h.name: a for h, a in found.equivalents(step) if h.name in open_to}
-        rows = {r.hypothesis.name: r.amplitude for r in step.scores if not r.has_wrong_sign}
-        more = known & rows.keys() & set(cause.get("class", ()))
-        amplitudes |= {name: rows[name] for name in sorted(more - amplitudes.keys())}
-        signed = {h.name for h in step.fit_before.linearisation.hypotheses if h.signed}
+    descriptions = [*content["causes"], *content["minor"]]
+    parameters = {p.name for p in result.end.model.parameters}  # no experiment shows what equals one of them
+    for cause, description in zip([*result.causes, *result.minor], descriptions, strict=True):
+        hypotheses = cause.fit_before.linearisation.hypotheses
+        known = {h.name for h in hypotheses if h.equivalent_parameter not in parameters}
+        candidates = known & {description["effect"], *(r["effect"] for r in description["rivals"])}
+        amplitudes = {h.name: a for h, a in result.equivalents(cause) if h.name in candidates}
+        by_score = {s.hypothesis.name: s.amplitude for s in cause.scores if not s.has_wrong_sign}
+        confounded = known & by_score.keys() & set(description.get("equivalence_class", ()))
+        amplitudes |= {name: by_score[name] for name in sorted(confounded - amplitudes.keys())}
+        signed = {h.name for h in hypotheses if h.signed}
         amplitudes = {name: a for name, a in amplitudes.items() if name in signed or a >= 0}
-        best = step.candidate.hypothesis.name
+        best = cause.candidate.hypothesis.name
         pairs = tuple((best, other) for other in amplitudes if other != best)
         if best in amplitudes and pairs:
-            return Question(step.fit_before, amplitudes, pairs)
-    if found.causes:
+            return OpenQuestion(cause.fit_before, amplitudes, pairs)
+    if result.causes:
         return None
-    known = {h.name for h in found.end.linearisation.hypotheses if h.equivalent_parameter not in fitted}
-    open_rows = [r for r in found.scores if r.decision in ("present", "inconclusive") and r.hypothesis.name in known]
-    amplitudes = {r.hypothesis.name: r.hypothesis.smallest for r in open_rows[:MANY]}
-    return Question(found.end, amplitudes) if amplitudes else None
+    hypotheses = result.end.linearisation.hypotheses
+    known = {h.name for h in hypotheses if h.equivalent_parameter not in parameters}
+    undecided = [s for s in result.scores if s.decision in ("present", "inconclusive") and s.hypothesis.name in known]
+    undecided = undecided[: CRITERIA.proposal.max_undecided]
+    amplitudes = {s.hypothesis.name: s.hypothesis.smallest_of_interest for s in undecided}
+    return OpenQuestion(result.end, amplitudes) if amplitudes else None
 
 
-def information(question: Question, added: Sequence[Tensor]) -> Tensor:
-    """[causes, causes] that is left beside what is fitted anyway, of the data and of added experiments."""
-    found, own = question.fitted, question.fitted.linearisation.n_coordinates
-    columns = [*range(own), *(own + k for k in _columns(question))]
-    data = found.whitened.jacobian[:, columns]
-    square = data.mT @ data + sum(slopes.mT @ slopes for slopes in added)
-    square[range(own), range(own)] += prior_precision(found.model)
-    beside = torch.linalg.solve(square[:own, :own], square[:own, own:])
-    return square[own:, own:] - square[own:, :own] @ beside
+def compute_information(question: OpenQuestion, added: Sequence[Tensor]) -> Tensor:
+    """Return [causes, causes] the information beyond what is fitted anyway.
+
+    Args:
+        question: the causes, and the data.
+        added: whitened slopes of added experiments.
+    """
+    fitted, n = question.fitted, question.fitted.linearisation.n_coordinates
+    columns = [*range(n), *(n + k for k in _list_columns(question))]
+    slopes = fitted.whitened.jacobian[:, columns]
+    square = slopes.mT @ slopes + sum(other.mT @ other for other in added)
+    square[range(n), range(n)] += prior_precision(fitted.model)
+    compensation = torch.linalg.solve(square[:n, :n], square[:n, n:])
+    return square[n:, n:] - square[n:, :n] @ compensation
 
 
-def distances(question: Question, left: Tensor) -> dict[tuple[str, ...], float]:
-    """D of every pair, the smaller way round; of every cause alone where there are no pairs."""
+def compute_chi2(question: OpenQuestion, information: Tensor) -> dict[tuple[str, ...], float]:
+    """Return D of every pair, the smaller way round; of every cause alone if there are no pairs.
+
+    Args:
+        question: the causes.
+        information: [causes, causes] as ``compute_information`` returns it.
+    """
     index = {name: k for k, name in enumerate(question.amplitudes)}
     alone = {
-        name: a * a * float(left[k, k])
+        name: a * a * float(information[k, k])
         for (name, a), k in zip(question.amplitudes.items(), index.values(), strict=True)
     }
     if not question.pairs:
         return {(name,): d for name, d in alone.items()}
-    out = {}
+    chi2, tolerance = {}, CRITERIA.candidate.simulator_tolerance
     for a, b in question.pairs:
         i, j = index[a], index[b]
-        alike = float(left[i, j] ** 2 / (left[i, i] * left[j, j]).clamp(min=1e-30))
-        out[(a, b)] = min(alone[a], alone[b]) * max(1 - alike - HARDLY, 0.0)
-    return out
+        square = float(information[i, j] ** 2 / (information[i, i] * information[j, j]).clamp(min=1e-30))
+        chi2[(a, b)] = min(alone[a], alone[b]) * max(1 - square - tolerance, 0.0)
+    return chi2
 
 
-def whitened_slopes(question: Question, recording: Recording, setting: DiagnosisData) -> Tensor:
-    """[C, own + causes] of an experiment that has not been done, by the present model on the coarser mesh.
+def simulate_whitened_slopes(question: OpenQuestion, recording: Recording, data: DiagnosisData) -> Tensor:
+    """Simulate the whitened slopes of an experiment that has not been done, by the present model on the coarse mesh.
 
-    Along causes as large as they were found: what wind brings along brakes whichever way that blows.
+    Causes have the amplitudes that were found: what wind implies brakes whichever way the wind blows.
+
+    Args:
+        question: the causes.
+        recording: the experiment.
+        data: the episodes, for the number of points.
+
+    Returns:
+        [B, coordinates + causes] slopes.
+
+    Raises:
+        InvalidInput: a cause with which the experiment cannot be simulated.
     """
-    found, model = question.fitted, question.fitted.model
-    asked = [found.linearisation.hypotheses[k] for k in _columns(question)]
-    hypotheses = [replace(h, typical=question.amplitudes[h.name] or h.typical) for h in asked]
-    world, shifts = question.worlds.plain, question.worlds.shifts
+    fitted, model = question.fitted, question.fitted.model
+    hypotheses = [
+        replace(h, typical=question.amplitudes[h.name] or h.typical)
+        for h in (fitted.linearisation.hypotheses[k] for k in _list_columns(question))
+    ]
+    world, shifts = question.worlds.base, question.worlds.shifts
     blank = extend_for_clock(build_episode(model.base.cloth, recording))
-    done = run_episode(question.worlds, blank, setting.dt, hypotheses, with_grasp_shifts=True)
-    trials = [t for t in done.with_hypotheses if t is not None]
-    if len(trials) < len(hypotheses):
+    runs = run_episode(question.worlds, blank, data.dt, hypotheses, with_grasp_shifts=True)
+    with_hypotheses = [frames for frames in runs.with_hypotheses if frames is not None]
+    if len(with_hypotheses) < len(hypotheses):
         raise InvalidInput("experiment", got="a cause that it cannot be simulated with", expected="another experiment")
-    base = done.plain
-    seen = as_seen(base, blank, setting)
-    moved = finite_differences(base, [*done.shifted, *trials], [*(s for _, s in shifts), *(h.typical for h in hypotheses)])
-    other, std = differentiate_nuisances(world, base, done.grasp_shifted, seen)
-    cells = bin_residuals(base, concatenate_directions(moved, other), seen, setting.sheet, setting.rest_positions)
-    cells = central_differences(cells, shifts, len(model.parameters))
+    base = runs.plain
+    observed = simulate_measurements(base, blank, data)
+    steps = [*(step for _, step in shifts), *(h.typical for h in hypotheses)]
+    derivatives = finite_differences(base, [*runs.shifted, *with_hypotheses], steps)
+    nuisances, std = differentiate_nuisances(world, base, runs.grasp_shifted, observed)
+    derivatives = concatenate_directions(derivatives, nuisances)
+    bins = bin_residuals(base, derivatives, observed, data.surface, data.rest_positions)
+    bins = central_differences(bins, shifts, len(model.parameters))
     count = len(model.point) + len(hypotheses)
-    level, _ = reference_noise(cells, torch.zeros_like(cells.value))
-    noise = Noise(torch.maximum(level.levels, found.noise.levels), found.noise.depth_level)
-    root = torch.linalg.cholesky(noise.covariance(cells, cells.jacobian[:, count:], std))
-    return torch.linalg.solve_triangular(root, cells.jacobian[:, :count], upper=False)
+    reference, _ = reference_noise(bins, torch.zeros_like(bins.value))
+    noise = Noise(torch.maximum(reference.levels, fitted.noise.levels), fitted.noise.depth_level)
+    factor = torch.linalg.cholesky(noise.covariance(bins, bins.jacobian[:, count:], std))
+    return torch.linalg.solve_triangular(factor, bins.jacobian[:, :count], upper=False)
 
 
-def as_seen(frames: Frames, blank: Episode, setting: DiagnosisData, seed: int = 0) -> Episode:
-    """The episode with points as many and as noisy as in the data, evenly over the surface, and felt forces."""
-    rng = torch.Generator().manual_seed(seed)
-    counts = sorted(len(c) for e in setting.episodes for c in e.clouds if len(c))
-    many = counts[len(counts) // 2] if counts else POINTS
-    faces, noise = setting.sheet.faces, blank.noise_std or 1e-3
-    corners = setting.rest_positions[faces]
+def simulate_measurements(frames: Frames, blank: Episode, data: DiagnosisData, seed: int = 0) -> Episode:
+    """Return the episode with simulated points and forces, as many and as noisy as in the data.
+
+    Args:
+        frames: the simulation.
+        blank: the episode without measurements.
+        data: the episodes.
+        seed: of the points, which are uniform over the surface, and of their noise.
+    """
+    generator = torch.Generator().manual_seed(seed)
+    counts = sorted(len(c) for e in data.episodes for c in e.clouds if len(c))
+    n_points = counts[len(counts) // 2] if counts else DEFAULT_POINTS_PER_FRAME
+    faces, noise_std = data.surface.faces, blank.noise_std or DEFAULT_POINT_NOISE_M
+    corners = data.rest_positions[faces]
     area = torch.linalg.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]).norm(dim=-1)
     clouds = []
     for x in frames.x:
-        face = faces[torch.multinomial(area, many, replacement=True, generator=rng)]
-        weight = -torch.rand(many, 3, generator=rng).log()
+        face = faces[torch.multinomial(area, n_points, replacement=True, generator=generator)]
+        weight = -torch.rand(n_points, 3, generator=generator).log()
         weight = (weight / weight.sum(1, keepdim=True)).to(x)
-        on = (weight[..., None] * x[face]).sum(1)
-        clouds.append(on + noise * torch.randn(many, 3, generator=rng).to(x))
-    felt = lambda w: w.isfinite().any(0)  # noqa: E731 - a force without a torque, or the other way round
-    wrenches = {name: torch.where(felt(w), frames.wrench[name], w) for name, w in blank.wrenches.items()}
+        points = (weight[..., None] * x[face]).sum(1)
+        clouds.append(points + noise_std * torch.randn(n_points, 3, generator=generator).to(x))
+    wrenches = {}
+    for name, measured in blank.wrenches.items():
+        is_measured = measured.isfinite().any(0)  # a force may be measured without a torque, or the other way round
+        wrenches[name] = torch.where(is_measured, frames.wrench[name], measured)
     return drop_unsimulated_frames(replace(blank, clouds=clouds, wrenches=wrenches))
 
 
-def _columns(question: Question) -> list[int]:
+def _list_columns(question: OpenQuestion) -> list[int]:
     index = {h.name: k for k, h in enumerate(question.fitted.linearisation.hypotheses)}
     return [index[name] for name in question.amplitudes]
 
 
-def _weakest(told: Mapping[tuple[str, ...], float]) -> float:
-    return min(told.values())
+def _rate(chi2: Mapping[tuple[str, ...], float], question: OpenQuestion) -> tuple[float, float]:
+    """Rate an experiment by its weakest pair, or by how many single causes it detects; then by all together.
+
+    A single cause that no experiment detects must not decide.
+    """
+    total = sum(math.log1p(d) for d in chi2.values())
+    if question.pairs:
+        return min(chi2.values()), total
+    return sum(min(d / CRITERIA.proposal.min_chi2, 1.0) for d in chi2.values()), total
 
 
-def _worth(told: Mapping[tuple[str, ...], float], question: Question) -> tuple[float, float]:
-    """Of pairs the weakest, then all; of single causes how many are seen, since one that never is must not decide."""
-    every = sum(math.log1p(d) for d in told.values())
-    return (_weakest(told) if question.pairs else sum(min(d / NEEDED, 1.0) for d in told.values()), every)
-
-
-def _repeats(question: Question, slopes: Tensor) -> int | None:
-    """How often it must be done; None: more than can be asked."""
-    for n in range(1, MOST_REPEATS + 1):
-        told = distances(question, information(question, [slopes] * n))
-        if _weakest(told) >= NEEDED:
+def _count_repetitions(question: OpenQuestion, slopes: Tensor) -> int | None:
+    """Return how often an experiment must be done; None: more often than is proposed."""
+    for n in range(1, CRITERIA.proposal.max_repetitions + 1):
+        chi2 = compute_chi2(question, compute_information(question, [slopes] * n))
+        if min(chi2.values()) >= CRITERIA.proposal.min_chi2:
             return n
     return None
 
 
-def _why(
+def _explain(
     experiment: Experiment,
-    question: Question,
+    question: OpenQuestion,
     now: Mapping[tuple[str, ...], float],
-    told: Mapping[tuple[str, ...], float],
+    chi2: Mapping[tuple[str, ...], float],
     median: float,
-    repeats: int | None,
+    repetitions: int | None,
 ) -> str:
-    hardest = min(told, key=lambda key: told[key])
+    criteria = CRITERIA.proposal
+    hardest = min(chi2, key=lambda key: chi2[key])
     if question.pairs:
-        about = f"{hardest[0]} is hardest to tell from {hardest[1]}"
+        what = f"{hardest[0]} is hardest to distinguish from {hardest[1]}"
     else:
-        about = f"{hardest[0]} is hardest to see"
-    times = {None: f"even {MOST_REPEATS} repetitions would not do", 1: "once is enough"}.get(
-        repeats, f"{repeats} repetitions"
+        what = f"{hardest[0]} is hardest to detect"
+    often = {None: f"even {criteria.max_repetitions} repetitions do not suffice", 1: "once is enough"}.get(
+        repetitions, f"{repetitions} repetitions"
     )
     return (
-        f"{experiment}: {about}, by chi^2 = {now[hardest]:.2g} now and {told[hardest]:.2g} with it "
-        f"({NEEDED:.1f} is needed; {times}). Half of all motions that can be asked for give less than {median:.2g}."
+        f"{experiment}: {what}, by chi^2 = {now[hardest]:.2g} now and {chi2[hardest]:.2g} with it "
+        f"({criteria.min_chi2:.1f} is needed; {often}). Half of all possible motions give less than {median:.2g}."
     )

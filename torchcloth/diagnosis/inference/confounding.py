@@ -1,7 +1,7 @@
-"""Hypotheses that these data cannot tell from each other.
+"""Hypotheses that the data cannot distinguish.
 
-D_ij = a_i^2 V_ii (1 - rho_ij^2) is the chi^2 by which i at amplitude a_i can be told from j at its best amplitude, by
-slopes; of two that were fitted it is the square of what lies between the two models.
+D_ij = a_i^2 V_ii (1 - rho_ij^2) is the linearised chi-squared that distinguishes hypothesis i at amplitude a_i from
+hypothesis j at its best amplitude. For two fitted models it is the squared distance of their whitened residuals.
 """
 
 from __future__ import annotations
@@ -10,50 +10,57 @@ from collections.abc import Sequence
 
 from torch import Tensor
 
+from ..decide.criteria import CRITERIA
 from .fitting import ModelFit, reweight_by_noise
 from .linearise import restrict_to_common_bins
 from .noise import Noise
 from .robust_weights import remove_weights
 from .screening import ScoreTest, build_projection
 
-TOLD = 9.0  # chi^2, three standard deviations
-ALIKE = 0.99  # correlation
+
+def correlate_scores(fitted: ModelFit) -> Tensor:
+    """Return [hypotheses, hypotheses] the correlations of the efficient scores."""
+    slopes = build_projection(fitted)(fitted.whitened.jacobian[:, fitted.linearisation.n_coordinates :])
+    norm = slopes.norm(dim=0).clamp(min=1e-12)
+    return (slopes.mT @ slopes) / (norm[:, None] * norm)
 
 
-def correlate_scores(found: ModelFit) -> Tensor:
-    """[hypotheses, hypotheses] of the efficient scores."""
-    asked = build_projection(found)(found.whitened.jacobian[:, found.linearisation.n_coordinates :])
-    norm = asked.norm(dim=0).clamp(min=1e-12)
-    return (asked.mT @ asked) / (norm[:, None] * norm)
+def find_confounded(
+    fitted: ModelFit, score: ScoreTest, amplitude: float, others: Sequence[ScoreTest]
+) -> list[ScoreTest]:
+    """Return the hypotheses that cannot be distinguished from one hypothesis, linearised.
 
+    Directions of the same effect do not count, nor does a hypothesis that would need a sign that it cannot have. If the
+    slopes ask for another one with the opposite sign, its amplitude is the one that would take the place of the first.
 
-def find_confounded(found: ModelFit, row: ScoreTest, amplitude: float, others: Sequence[ScoreTest]) -> list[ScoreTest]:
-    """Those of ``others`` that cannot be told from ``row`` at this amplitude or the one that was asked for.
-
-    Directions of the same effect are none, nor is what would have to have a sign that it cannot have. Where slopes ask
-    for one the other way round, its amplitude is what would stand in for the cause.
+    Args:
+        fitted: the model without the hypothesis.
+        score: score test of the hypothesis.
+        amplitude: its fitted amplitude; the larger of this and the one that was asked for counts.
+        others: score tests of the hypotheses to compare with.
     """
     if not others:
         return []
-    index = {h.name: k for k, h in enumerate(found.linearisation.hypotheses)}
-    if row.hypothesis.name not in index:  # no world could have it there
+    index = {h.name: k for k, h in enumerate(fitted.linearisation.hypotheses)}
+    if score.hypothesis.name not in index:  # it could not be simulated there
         return []
-    rho = correlate_scores(found)[index[row.hypothesis.name]]
-    square = max(row.chi2, (amplitude / row.std) ** 2)
-    out = []
+    criteria = CRITERIA.confounding
+    correlation = correlate_scores(fitted)[index[score.hypothesis.name]]
+    chi2 = max(score.chi2, (amplitude / score.std) ** 2)
+    confounded = []
     for other in others:
-        r = float(rho[index[other.hypothesis.name]])
-        if not other.hypothesis.signed and r * amplitude < 0:
+        rho = float(correlation[index[other.hypothesis.name]])
+        if not other.hypothesis.signed and rho * amplitude < 0:
             continue
-        told = square * (1 - r * r)
-        if other.hypothesis.effect != row.hypothesis.effect and (abs(r) > ALIKE or told < TOLD):
-            instead = r * amplitude * other.std / row.std
-            out.append(other if other.amplitude * instead >= 0 else other._replace(amplitude=instead))
-    return out
+        is_confounded = abs(rho) > criteria.min_correlation or chi2 * (1 - rho * rho) < criteria.max_chi2
+        if other.hypothesis.effect != score.hypothesis.effect and is_confounded:
+            substitute = rho * amplitude * other.std / score.std
+            confounded.append(other if other.amplitude * substitute >= 0 else other._replace(amplitude=substitute))
+    return confounded
 
 
 def are_fits_confounded(one: ModelFit, other: ModelFit, noise: Noise) -> bool:
-    """Two models that cannot be told from each other where either was fitted, whatever slopes said elsewhere."""
-    like = restrict_to_common_bins(one.linearisation, [other.linearisation])
-    mine, others = (remove_weights(reweight_by_noise(found, noise, like).whitened).value for found in (one, other))
-    return float((mine - others).square().sum()) < TOLD
+    """Check whether two fitted models cannot be distinguished, whatever the slopes say elsewhere."""
+    common = restrict_to_common_bins(one.linearisation, [other.linearisation])
+    first, second = (remove_weights(reweight_by_noise(fitted, noise, common).whitened).value for fitted in (one, other))
+    return float((first - second).square().sum()) < CRITERIA.confounding.max_chi2

@@ -1,4 +1,4 @@
-"""What one episode says at a point: all simulations of it, side by side, and the cells that they make."""
+"""Simulation of one episode at a point of the model: all runs, in parallel, and the bins that they give."""
 
 from __future__ import annotations
 
@@ -14,201 +14,266 @@ from torch import Tensor
 
 from ...episodes.observed import Episode
 from ...episodes.replay import Frames
-from ...episodes.steps import taken
+from ...episodes.steps import clip_step
 from ...episodes.world import Hypothesis, World
-from ...episodes.world_cache import Worlds, if_possible
-from ...identification.nuisances import Camera, Clock, Held, Rim, Tare
-from ..data.binning import BinnedResiduals, EpisodeEvidence, align_rows, bin_residuals, finite_differences, concatenate_directions
+from ...episodes.world_cache import WorldCache, none_if_impossible
+from ...identification.nuisances import CameraOffset, ClockOffset, ForceTare, GraspOffset, RimOffset
+from ..data.binning import (
+    BinnedResiduals,
+    EpisodeEvidence,
+    align_rows,
+    bin_residuals,
+    concatenate_directions,
+    finite_differences,
+)
 from ..data.dataset import DiagnosisData
 
-CLOCK, SHIFT, TURN, GRASP, RIM, TARE = 3e-3, 5e-4, 1e-3, 1.5e-3, 2e-3, 0.1  # standard deviations between episodes
+# standard deviations of the nuisances, which differ from episode to episode
+CLOCK_STD_S = 3e-3
+CAMERA_SHIFT_STD_M = 5e-4
+CAMERA_TURN_STD_RAD = 1e-3
+GRASP_STD_M = 1.5e-3
+RIM_STD_M = 2e-3
+TARE_STD = 0.1  # of a force [N] and of a torque [N m]
 T = TypeVar("T")
 U = TypeVar("U")
+ShiftedRun = tuple[Frames, float, bool]
+"""Frames at a shifted point, the step that leads there, and whether they are on the fine mesh."""
 
 
 def simulate_episode(
-    worlds: Worlds,
-    setting: DiagnosisData,
+    worlds: WorldCache,
+    data: DiagnosisData,
     k: int,
     hypotheses: Sequence[Hypothesis],
-    known: Sequence[Tensor] | None,
+    known_nuisances: Sequence[Tensor] | None,
 ) -> EpisodeEvidence:
-    """What the k-th episode says; ``known`` slopes along its nuisances are not taken anew."""
-    e, world = setting.episodes[k], worlds.plain
-    finer: DiagnosisData = setting.fine_mesh  # type: ignore[assignment]
-    steps = [taken(worlds.model, coordinate, step) for coordinate, step in worlds.shifts]
-    found = run_episode(worlds, e, setting.dt, hypotheses, known is None, (finer.episodes[k], finer.dt), with_fine=True)
-    base, able = found.plain, [t is not None for t in found.with_hypotheses]
-    sides = [*zip(found.shifted, steps, worlds.finer_beside, strict=True), *_trials(hypotheses, found)]
-    moved, fine = _slopes(base, sides, False), _slopes(found.fine, sides, True)
-    if known is None:
-        other, std = differentiate_nuisances(world, base, found.grasp_shifted, e)
-        coarse = bin_residuals(base, other if moved is None else concatenate_directions(moved, other), e, setting.sheet, setting.rest_positions)
+    """Compute residuals and derivatives of the k-th episode.
+
+    Args:
+        worlds: the model's worlds at its point and at the shifted points.
+        data: the episodes.
+        k: index of the episode.
+        hypotheses: along which derivatives are computed.
+        known_nuisances: (keys [B], slopes [B, N], standard deviations [N]) along the nuisances, which are then not
+            simulated again.
+    """
+    e, world = data.episodes[k], worlds.base
+    fine_data: DiagnosisData = data.fine_mesh  # type: ignore[assignment]
+    steps = [clip_step(worlds.model, coordinate, step) for coordinate, step in worlds.shifts]
+    fine_episode = (fine_data.episodes[k], fine_data.dt)
+    runs = run_episode(worlds, e, data.dt, hypotheses, known_nuisances is None, fine_episode, with_fine=True)
+    base, is_simulated = runs.plain, [frames is not None for frames in runs.with_hypotheses]
+    shifted = [*zip(runs.shifted, steps, worlds.shifted_on_fine_mesh, strict=True), *_hypothesis_runs(hypotheses, runs)]
+    slopes, fine_slopes = _differentiate(base, shifted, False), _differentiate(runs.fine, shifted, True)
+    if known_nuisances is None:
+        along_nuisances, std = differentiate_nuisances(world, base, runs.grasp_shifted, e)
+        slopes = along_nuisances if slopes is None else concatenate_directions(slopes, along_nuisances)
+        coarse = bin_residuals(base, slopes, e, data.surface, data.rest_positions)
     else:
-        key, slopes, std = known
-        coarse = bin_residuals(base, moved, e, setting.sheet, setting.rest_positions)
-        others, new = align_rows(coarse.key, key, slopes), ~torch.isin(coarse.key, key)
-        if bool(new.any()):  # seen there for the first time; how grasps move it would take simulations
-            anew = bin_residuals(base, differentiate_nuisances(world, base, [], e)[0], e, setting.sheet, setting.rest_positions)
-            others[new, : anew.jacobian.shape[1]] = align_rows(coarse.key, anew.key, anew.jacobian)[new]
-        coarse = coarse._replace(jacobian=torch.cat([coarse.jacobian, others], 1))
-    finer_cells = bin_residuals(found.fine, fine, finer.episodes[k], finer.sheet, finer.rest_positions)  # type: ignore[arg-type]
-    kept, difference = _replaced(_woven(coarse, finer_cells, sides), finer_cells)
-    return EpisodeEvidence(kept, std, difference, torch.tensor(able, dtype=torch.bool))
+        key, nuisance_slopes, std = known_nuisances
+        coarse = bin_residuals(base, slopes, e, data.surface, data.rest_positions)
+        nuisance_columns, is_new = align_rows(coarse.key, key, nuisance_slopes), ~torch.isin(coarse.key, key)
+        if bool(is_new.any()):  # bins that appear for the first time; slopes along grasps would need simulations
+            along_nuisances, _ = differentiate_nuisances(world, base, [], e)
+            new = bin_residuals(base, along_nuisances, e, data.surface, data.rest_positions)
+            nuisance_columns[is_new, : new.jacobian.shape[1]] = align_rows(coarse.key, new.key, new.jacobian)[is_new]
+        coarse = coarse._replace(jacobian=torch.cat([coarse.jacobian, nuisance_columns], 1))
+    fine_frames: Frames = runs.fine  # type: ignore[assignment]
+    fine = bin_residuals(fine_frames, fine_slopes, fine_episode[0], fine_data.surface, fine_data.rest_positions)
+    bins, difference = _take_fine_values(_merge_slopes(coarse, fine, shifted), fine)
+    return EpisodeEvidence(bins, std, difference, torch.tensor(is_simulated, dtype=torch.bool))
 
 
-def simulate_hypotheses(worlds: Worlds, setting: DiagnosisData, k: int, hypotheses: Sequence[Hypothesis]) -> EpisodeEvidence:
-    """Slopes of the k-th episode along hypotheses alone; ``worlds`` without shifts."""
-    e, finer = setting.episodes[k], setting.fine_mesh
-    found = run_episode(worlds, e, setting.dt, hypotheses, False, finer and (finer.episodes[k], finer.dt))
-    base, able = found.plain, [t is not None for t in found.with_hypotheses]
-    sides = list(_trials(hypotheses, found))
-    cells = bin_residuals(base, _slopes(base, sides, False), e, setting.sheet, setting.rest_positions)
-    if finer is not None and found.fine is not None:
-        fine = _slopes(found.fine, sides, True)
-        cells = _woven(cells, bin_residuals(found.fine, fine, finer.episodes[k], finer.sheet, finer.rest_positions), sides)
+def simulate_hypotheses(
+    worlds: WorldCache, data: DiagnosisData, k: int, hypotheses: Sequence[Hypothesis]
+) -> EpisodeEvidence:
+    """Compute derivatives of the k-th episode along hypotheses alone; ``worlds`` has no shifts."""
+    e, fine_data = data.episodes[k], data.fine_mesh
+    runs = run_episode(worlds, e, data.dt, hypotheses, False, fine_data and (fine_data.episodes[k], fine_data.dt))
+    base, is_simulated = runs.plain, [frames is not None for frames in runs.with_hypotheses]
+    shifted = list(_hypothesis_runs(hypotheses, runs))
+    bins = bin_residuals(base, _differentiate(base, shifted, False), e, data.surface, data.rest_positions)
+    if fine_data is not None and runs.fine is not None:
+        slopes = _differentiate(runs.fine, shifted, True)
+        fine = bin_residuals(runs.fine, slopes, fine_data.episodes[k], fine_data.surface, fine_data.rest_positions)
+        bins = _merge_slopes(bins, fine, shifted)
     none = torch.zeros(0, dtype=torch.float64)
-    return EpisodeEvidence(cells, none, none, torch.tensor(able, dtype=torch.bool))
+    return EpisodeEvidence(bins, none, none, torch.tensor(is_simulated, dtype=torch.bool))
 
 
-Side = tuple[Frames, float, bool]  # beside the point, by which step, and whether on the finer mesh
-
-
-def _trials(hypotheses: Sequence[Hypothesis], found: EpisodeRuns) -> Iterator[Side]:
-    """Of what could be simulated."""
-    for k, (h, frames) in enumerate(zip(hypotheses, found.with_hypotheses, strict=True)):
+def _hypothesis_runs(hypotheses: Sequence[Hypothesis], runs: EpisodeRuns) -> Iterator[ShiftedRun]:
+    for k, (h, frames) in enumerate(zip(hypotheses, runs.with_hypotheses, strict=True)):
         if frames is not None:
-            yield frames, h.typical, k in found.fine_hypotheses
+            yield frames, h.typical, k in runs.fine_hypotheses
 
 
-def _slopes(base: Frames | None, sides: Sequence[Side], finer: bool) -> Frames | None:
-    """Along those on one mesh; None: there are none."""
-    own = [(frames, step) for frames, step, fine in sides if fine == finer]
-    return finite_differences(base, *zip(*own, strict=True)) if own and base else None
+def _differentiate(base: Frames | None, shifted: Sequence[ShiftedRun], on_fine: bool) -> Frames | None:
+    """Return the derivatives along the runs on one mesh; None without any."""
+    runs = [(frames, step) for frames, step, is_fine in shifted if is_fine == on_fine]
+    return finite_differences(base, *zip(*runs, strict=True)) if runs and base else None
 
 
-def _woven(coarse: BinnedResiduals, fine: BinnedResiduals, sides: Sequence[Side]) -> BinnedResiduals:
-    """The coarse cells, first with a column for each side, from its own mesh."""
-    first = [k for k, (*_, finer) in enumerate(sides) if not finer]
-    last = [k for k, (*_, finer) in enumerate(sides) if finer]
-    own, rest = coarse.jacobian[:, : len(first)], coarse.jacobian[:, len(first) :]
-    columns = torch.cat([own, align_rows(coarse.key, fine.key, fine.jacobian)], 1)
-    order = torch.argsort(torch.tensor([*first, *last], dtype=torch.int64))
-    return coarse._replace(jacobian=torch.cat([columns[:, order], rest], 1))
+def _merge_slopes(coarse: BinnedResiduals, fine: BinnedResiduals, shifted: Sequence[ShiftedRun]) -> BinnedResiduals:
+    """Return the coarse bins with one column for each shifted run, from its own mesh, before all others."""
+    on_coarse = [k for k, (*_, is_fine) in enumerate(shifted) if not is_fine]
+    on_fine = [k for k, (*_, is_fine) in enumerate(shifted) if is_fine]
+    slopes, others = coarse.jacobian[:, : len(on_coarse)], coarse.jacobian[:, len(on_coarse) :]
+    columns = torch.cat([slopes, align_rows(coarse.key, fine.key, fine.jacobian)], 1)
+    order = torch.argsort(torch.tensor([*on_coarse, *on_fine], dtype=torch.int64))
+    return coarse._replace(jacobian=torch.cat([columns[:, order], others], 1))
 
 
 class EpisodeRuns(NamedTuple):
-    """All simulations of one episode."""
+    """All simulations of one episode.
 
-    fine: Frames | None  # on the finer mesh; None where nobody asked
-    plain: Frames  # at the point
-    shifted: list[Frames]  # along the model's own coordinates, each on the mesh of its slopes
-    grasp_shifted: list[Frames]  # with the held places off
-    with_hypotheses: list[Frames | None]  # with each hypothesis; None: cannot be simulated
-    fine_hypotheses: set[int]  # which of these are on the finer mesh
+    Attributes:
+        fine: at the point, on the fine mesh; None if not asked for.
+        plain: at the point.
+        shifted: along the model's coordinates, each on the mesh of its slopes.
+        grasp_shifted: with grasped vertices shifted.
+        with_hypotheses: with each hypothesis; None: it cannot be simulated.
+        fine_hypotheses: indices of the hypotheses that were simulated on the fine mesh.
+    """
+
+    fine: Frames | None
+    plain: Frames
+    shifted: list[Frames]
+    grasp_shifted: list[Frames]
+    with_hypotheses: list[Frames | None]
+    fine_hypotheses: set[int]
 
 
 def run_episode(
-    worlds: Worlds,
+    worlds: WorldCache,
     e: Episode,
     dt: float | None,
     hypotheses: Sequence[Hypothesis],
     with_grasp_shifts: bool,
-    finer: tuple[Episode, float | None] | None = None,
+    fine_episode: tuple[Episode, float | None] | None = None,
     with_fine: bool = False,
 ) -> EpisodeRuns:
-    """An episode in a world, in those beside it, with every hypothesis and with held places off, side by side.
+    """Simulate an episode at the model's point, at shifted points and with each hypothesis, in parallel.
 
     Args:
-        worlds: about the model's point.
+        worlds: around the model's point.
         e: the episode.
         dt: its substep [s]; None: the stable one.
-        hypotheses: with each of which it is simulated.
-        with_held: with held places off, too.
-        finer: the same episode and substep on the finer mesh; None: the worlds have none.
-        with_fine: on the finer mesh in any case, and not only if something has its slopes there.
+        hypotheses: each is simulated at its typical amplitude.
+        with_grasp_shifts: whether to simulate shifted grasps as well.
+        fine_episode: the same episode and its substep on the fine mesh; None: the worlds have no fine mesh.
+        with_fine: whether to simulate the fine mesh in any case, and not only if a slope needs it.
     """
-    world, own = worlds.plain, (e, dt)
-    on = lambda fine: finer if fine and finer else own  # noqa: E731
-    beside = [partial(w.frames, *on(fine)) for w, fine in zip(worlds.beside, worlds.finer_beside, strict=True)]
-    modes = Held().modes(world.cloth, e) if with_grasp_shifts else ()
-    held = [partial(world.frames, replace(e, initial=e.initial + GRASP * m), dt) for m in modes]
-    changed = [worlds.changed(h) for h in hypotheses]
-    moves = [c is not None and _moves(c, world) for c in changed]
-    first = [partial(worlds.seen, *finer, finer=True)] if with_fine and finer else []  # it takes longest
-    jobs = [*first, partial(worlds.happens, e, dt), *beside, *held]
-    tried = [
-        partial(if_possible, partial(c.frames, *own)) for c, other in zip(changed, moves, strict=True) if c and other
+    world = worlds.base
+    shifted = [
+        partial(w.simulate_observed, *(fine_episode if on_fine and fine_episode else (e, dt)))
+        for w, on_fine in zip(worlds.shifted, worlds.shifted_on_fine_mesh, strict=True)
     ]
-    done: list[Any] = map_parallel(lambda job: job(), [*jobs, *tried])
-    happens, *sure = done[len(first) : len(jobs)]
-    rest = iter(done[len(jobs) :])
-    seen = lambda c: c and if_possible(partial(c.seen, happens, e))  # noqa: E731
-    trials = [next(rest) if other else seen(c) for c, other in zip(changed, moves, strict=True)]
-    fine, plain = done[0] if first else None, world.seen(happens, e)
-    folds = {
+    modes = GraspOffset().initial_shape_modes(world.cloth, e) if with_grasp_shifts else ()
+    grasps = [
+        partial(world.simulate_observed, replace(e, initial=e.initial + GRASP_STD_M * mode), dt) for mode in modes
+    ]
+    changed = [worlds.with_typical(h) for h in hypotheses]
+    # only what changes more than the observer is simulated again
+    needs_run = [
+        c is not None and (c.cloth is not world.cloth or c.motion_transforms is not world.motion_transforms)
+        for c in changed
+    ]
+    fine_jobs = [partial(worlds.observe, *fine_episode, fine=True)] if with_fine and fine_episode else []  # the longest
+    jobs = [*fine_jobs, partial(worlds.simulate, e, dt), *shifted, *grasps]
+    hypothesis_jobs = [
+        partial(none_if_impossible, partial(c.simulate_observed, e, dt))
+        for c, run in zip(changed, needs_run, strict=True)
+        if c and run
+    ]
+    results: list[Any] = map_parallel(lambda job: job(), [*jobs, *hypothesis_jobs])
+    simulated, *others = results[len(fine_jobs) : len(jobs)]
+    hypothesis_results = iter(results[len(jobs) :])
+    with_hypotheses: list[Frames | None] = []
+    for c, run in zip(changed, needs_run, strict=True):
+        with_hypotheses.append(
+            next(hypothesis_results) if run else c and none_if_impossible(partial(c.observe, simulated, e))
+        )
+    fine, plain = results[0] if fine_jobs else None, world.observe(simulated, e)
+    fine_hypotheses = {
         k: h
-        for k, (h, t) in enumerate(zip(hypotheses, trials, strict=True))
-        if worlds.is_finer(h) and t is not None and not torch.equal(t.x, plain.x)
+        for k, (h, frames) in enumerate(zip(hypotheses, with_hypotheses, strict=True))
+        if worlds.uses_fine_mesh(h) and frames is not None and not torch.equal(frames.x, plain.x)
     }
-    if finer and folds:
-        fine, again = _refined(worlds, list(folds.values()), finer, fine)
-        for k, frames in zip(folds, again, strict=True):
-            trials[k] = frames
-    return EpisodeRuns(fine, plain, sure[: len(beside)], sure[len(beside) :], trials, set(folds))
+    if fine_episode and fine_hypotheses:
+        fine, repeated = _run_on_fine_mesh(worlds, list(fine_hypotheses.values()), fine_episode, fine)
+        for k, frames in zip(fine_hypotheses, repeated, strict=True):
+            with_hypotheses[k] = frames
+    n_shifted = len(shifted)
+    return EpisodeRuns(fine, plain, others[:n_shifted], others[n_shifted:], with_hypotheses, set(fine_hypotheses))
 
 
-def _refined(
-    worlds: Worlds, hypotheses: Sequence[Hypothesis], finer: tuple[Episode, float | None], fine: Frames | None
+def _run_on_fine_mesh(
+    worlds: WorldCache,
+    hypotheses: Sequence[Hypothesis],
+    fine_episode: tuple[Episode, float | None],
+    fine: Frames | None,
 ) -> tuple[Frames, list[Frames | None]]:
-    """On the finer mesh: (the episode, if it is not there yet, the episode with each hypothesis)."""
-    first = [] if fine else [partial(worlds.seen, *finer, finer=True)]
-    changed = [worlds.changed(h, finer=True) for h in hypotheses]
-    tried = [partial(if_possible, partial(c.frames, *finer)) if c else lambda: None for c in changed]
-    done: list[Any] = map_parallel(lambda job: job(), [*first, *tried])
-    return fine or done[0], done[len(first) :]
-
-
-def _moves(changed: World, world: World) -> bool:
-    """More than how it is looked at has changed."""
-    return changed.cloth is not world.cloth or changed.motions is not world.motions
+    """Return the episode on the fine mesh, simulated if ``fine`` is None, and the episode with each hypothesis."""
+    jobs = [] if fine else [partial(worlds.observe, *fine_episode, fine=True)]
+    changed = [worlds.with_typical(h, fine=True) for h in hypotheses]
+    hypothesis_jobs = [
+        partial(none_if_impossible, partial(c.simulate_observed, *fine_episode)) if c else lambda: None for c in changed
+    ]
+    results: list[Any] = map_parallel(lambda job: job(), [*jobs, *hypothesis_jobs])
+    return fine or results[0], results[len(jobs) :]
 
 
 def map_parallel(work: Callable[[T], U], items: Sequence[T]) -> list[U]:
-    """Results in order, on all cores: simulations are independent, and the engine leaves Python alone meanwhile."""
+    """Apply a function to items on all cores, and return the results in order.
+
+    Threads suffice: simulations are independent, and the engine releases Python's lock.
+    """
     return list(iterate_parallel(work, items))
 
 
 def iterate_parallel(work: Callable[[T], U], items: Sequence[T]) -> Generator[U, None, None]:
-    """The same, one after the other as they are asked for."""
-    # of torch's threads, a new thread has as many as there are cores
+    """Yield the results of ``map_parallel`` one after the other."""
+    # torch gives a new thread as many threads of its own as there are cores, so their number is set
     pool = ThreadPoolExecutor(os.cpu_count(), initializer=torch.set_num_threads, initargs=(torch.get_num_threads(),))
     try:
         yield from pool.map(work, items)
     finally:
-        pool.shutdown(cancel_futures=True)  # when interrupted, what has begun ends and nothing else begins
+        pool.shutdown(cancel_futures=True)  # when interrupted, running jobs end and no other begins
 
 
-def _replaced(coarse: BinnedResiduals, fine: BinnedResiduals) -> tuple[BinnedResiduals, Tensor]:
-    """(cells that both have, with the slopes of the first and the values of the second; first minus second)."""
-    both = torch.isin(coarse.key, fine.key)
-    kept = coarse.select(both)
+def _take_fine_values(coarse: BinnedResiduals, fine: BinnedResiduals) -> tuple[BinnedResiduals, Tensor]:
+    """Return (common bins with the slopes of the coarse and the values of the fine mesh, coarse minus fine value)."""
+    bins = coarse.select(torch.isin(coarse.key, fine.key))
     order = torch.argsort(fine.key)
-    place = order[torch.searchsorted(fine.key[order], kept.key)]
-    return kept._replace(value=fine.value[place], spread=fine.row_std[place]), kept.value - fine.value[place]
+    index = order[torch.searchsorted(fine.key[order], bins.key)]
+    return bins._replace(value=fine.value[index], row_std=fine.row_std[index]), bins.value - fine.value[index]
 
 
-def differentiate_nuisances(world: World, base: Frames, held: Sequence[Frames], e: Episode) -> tuple[Frames, Tensor]:
-    """Derivatives along what differs from episode to episode, and its standard deviations."""
-    moved, steps, stds = [], [], []
-    for kind, std in ((Clock(), [CLOCK]), (Camera(), [SHIFT] * 3 + [TURN] * 3), (Rim(), [RIM]), (Tare(), None)):
-        parts = len(kind.parts(world.cloth, e))
+def differentiate_nuisances(
+    world: World, base: Frames, grasp_shifted: Sequence[Frames], e: Episode
+) -> tuple[Frames, Tensor]:
+    """Return the derivatives along the nuisances of an episode, and their standard deviations [N].
+
+    Args:
+        world: the model's world.
+        base: the episode at the model's point.
+        grasp_shifted: the episode with shifted grasps.
+        e: the episode.
+    """
+    camera_stds = [CAMERA_SHIFT_STD_M] * 3 + [CAMERA_TURN_STD_RAD] * 3
+    shifted, steps, stds = [], [], []
+    for nuisance, known_stds in (
+        (ClockOffset(), [CLOCK_STD_S]), (CameraOffset(), camera_stds), (RimOffset(), [RIM_STD_M]), (ForceTare(), None)
+    ):  # fmt: skip
+        parts = len(nuisance.number_names(world.cloth, e))
         for k in range(parts):
-            own = TARE if std is None else std[k]
+            std = TARE_STD if known_stds is None else known_stds[k]
             values = torch.zeros(parts, dtype=base.x.dtype)
-            values[k] = 0.5 * own
-            moved.append(kind.see(base, values, e))
-            steps.append(0.5 * own)
-            stds.append(own)
-    every = [GRASP] * len(held)
-    return finite_differences(base, [*moved, *held], [*steps, *every]), torch.tensor([*stds, *every], dtype=torch.float64)
+            values[k] = 0.5 * std
+            shifted.append(nuisance.observe(base, values, e))
+            steps.append(0.5 * std)
+            stds.append(std)
+    grasp_stds = [GRASP_STD_M] * len(grasp_shifted)
+    derivatives = finite_differences(base, [*shifted, *grasp_shifted], [*steps, *grasp_stds])
+    return derivatives, torch.tensor([*stds, *grasp_stds], dtype=torch.float64)

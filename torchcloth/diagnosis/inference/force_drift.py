@@ -1,107 +1,117 @@
-"""Forces that grow with time in all motions alike: too little to be seen in one of them, and no chance in all.
+"""Drift of forces that is common to all motions: too small to be seen in one motion, and significant in all.
 
 The rate c of a force c t, from each episode's start on, is in one episode
 
     c_k = d' K^-1 r / d' K^-1 d,  variance 1 / d' K^-1 d,
 
-with K what a right model leaves (``lacking.right``), which knows of tares, and d the time of the cells of that force.
-Motions are pooled with what they differ by beyond that (DerSimonian and Laird 1986): what depends on the motion is no
-drift. What few of them differ by is not well known, so the mean has Student's distribution, with as many degrees of
-freedom as its variance has (Satterthwaite 1946).
+with the covariance K of a correct model (``lack_of_fit.expected_covariance``), which includes tares, and the time d of
+the force's bins. Motions are pooled with their scatter beyond that (DerSimonian and Laird 1986), because what depends
+on the motion is no drift. The scatter of a few motions is not well known, so the mean has Student's distribution, with
+the degrees of freedom of its variance (Satterthwaite 1946).
 """
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import torch
+from scipy.special import stdtr
 from torch import Tensor
 
-from ..data.binning import FORCE_BLOCK
+from ..data.binning import FORCE_BLOCK, BinnedResiduals
+from ..decide.criteria import CRITERIA
 from .fitting import ModelFit
-from .lack_of_fit import RARE, expected_covariance, do_meshes_agree
+from .lack_of_fit import do_meshes_agree, expected_covariance
 
-FEWEST = 4  # motions that can be alike
 AXES = "xyz"
+MIN_SCATTER_FRACTION = 1e-6  # of the mean's variance, so that its degrees of freedom stay finite
 
 
 class ForceDrift(NamedTuple):
-    """Of the forces on all grippers, measured less simulated, along one axis of the world."""
+    """Drift of the forces on all grippers, measured less simulated, along one axis of the world.
+
+    Attributes:
+        axis: "x", "y" or "z".
+        rate: mean over motions [N/s].
+        std: its standard error [N/s].
+        p_value: probability that a correct model drifts as much along any axis.
+    """
 
     axis: str
-    rate: float  # N/s
+    rate: float
     std: float
-    p_value: float  # of a right model's drifting as much along any axis
+    p_value: float
 
     @property
     def is_significant(self) -> bool:
-        """No chance."""
-        return self.p_value < RARE
+        """Whether a correct model hardly ever drifts as much."""
+        return self.p_value < CRITERIA.adequacy.max_p_value
 
     def as_dict(self) -> dict[str, Any]:
-        """As diagnosis.json has it."""
-        return {**self._asdict(), "unit": "N/s", "lacking": self.is_significant}
+        """Return the row of diagnosis.json."""
+        return {**self._asdict(), "unit": "N/s", "is_significant": self.is_significant}
 
 
-def estimate_force_drifts(found: ModelFit, names: Sequence[str]) -> list[ForceDrift]:
-    """One for each axis; none where fewer than four of the motions ``names`` have such forces and can be judged."""
-    later = lambda c: len(c.time) and bool(((c.block == FORCE_BLOCK) & (c.time > c.time.min())).any())  # noqa: E731
-    every: dict[str, list[tuple[Tensor, Tensor]]] = {}
-    for k, (name, cells) in enumerate(zip(names, found.linearisation.bins, strict=True)):
-        if later(cells) and do_meshes_agree(found, k):
-            every.setdefault(name, []).append(_rates(found, k))
-    if len(every) < FEWEST:
+def estimate_force_drifts(fitted: ModelFit, motions: Sequence[str]) -> list[ForceDrift]:
+    """Estimate the drift along each axis; an empty list if fewer than four motions have such forces.
+
+    Args:
+        fitted: a model at its solution.
+        motions: label of each episode.
+    """
+    min_motions = CRITERIA.adequacy.min_drift_motions
+    by_motion: dict[str, list[tuple[Tensor, Tensor]]] = {}
+    for k, (motion, bins) in enumerate(zip(motions, fitted.linearisation.bins, strict=True)):
+        if _has_later_forces(bins) and do_meshes_agree(fitted, k):
+            by_motion.setdefault(motion, []).append(_estimate_rates(fitted, k))
+    if len(by_motion) < min_motions:
         return []
-    rates, known = (torch.stack(column) for column in zip(*map(_together, every.values()), strict=True))
-    rows = []
-    for axis, rate, information in zip(AXES, rates.mT, known.mT, strict=True):
-        tells = information > 0  # cells of one axis may all jump
-        if int(tells.sum()) < FEWEST:
+    pooled = map(_pool_repetitions, by_motion.values())
+    rates, informations = (torch.stack(column) for column in zip(*pooled, strict=True))
+    drifts = []
+    for axis, rate, information in zip(AXES, rates.mT, informations.mT, strict=True):
+        is_informed = information > 0  # bins of one axis may all be left out
+        if int(is_informed.sum()) < min_motions:
             continue
-        mean, std, freedom = _pooled(rate[tells], 1 / information[tells])
-        rows.append(ForceDrift(axis, mean, std, min(1.0, len(AXES) * _beyond(abs(mean) / std, freedom))))
-    return rows
+        mean, std, dof = _pool_motions(rate[is_informed], 1 / information[is_informed])
+        p_value = 2 * float(stdtr(dof, -abs(mean) / std))
+        drifts.append(ForceDrift(axis, mean, std, min(1.0, len(AXES) * p_value)))
+    return drifts
 
 
-def _together(repeats: Sequence[tuple[Tensor, Tensor]]) -> tuple[Tensor, Tensor]:
-    """(rates, information) [axes] of one motion: repetitions of it share whatever the model gets wrong there."""
-    total = torch.stack([known for _, known in repeats]).sum(0)
-    return torch.stack([known * rate for rate, known in repeats]).sum(0) / _or_one(total), total
+def _has_later_forces(bins: BinnedResiduals) -> bool:
+    return len(bins.time) > 0 and bool(((bins.block == FORCE_BLOCK) & (bins.time > bins.time.min())).any())
 
 
-def _or_one(information: Tensor) -> Tensor:
+def _pool_repetitions(repetitions: Sequence[tuple[Tensor, Tensor]]) -> tuple[Tensor, Tensor]:
+    """Return (rates, informations) [axes] of one motion, whose repetitions share the model's error there."""
+    total = torch.stack([information for _, information in repetitions]).sum(0)
+    return torch.stack([information * rate for rate, information in repetitions]).sum(0) / _one_if_zero(total), total
+
+
+def _one_if_zero(information: Tensor) -> Tensor:
     return torch.where(information > 0, information, 1.0)
 
 
-def _rates(found: ModelFit, k: int) -> tuple[Tensor, Tensor]:
-    """(rates, information: inverse variances) [axes] of one episode with forces in more than one window."""
-    cells = found.linearisation.bins[k]
+def _estimate_rates(fitted: ModelFit, k: int) -> tuple[Tensor, Tensor]:
+    """Return (rates, informations) [axes] of one episode; an information is an inverse variance."""
+    bins = fitted.linearisation.bins[k]
     axis = torch.arange(len(AXES))
-    here = (cells.block == FORCE_BLOCK)[:, None] & (cells.channel[:, None] % 3 == axis)
-    since = torch.where(here, (cells.time - cells.time.min())[:, None], 0.0)
-    still, moved = expected_covariance(found, k)
-    weighed = torch.linalg.solve(still + moved @ moved.mT, since)
-    information = (weighed * since).sum(0)
-    return weighed.mT @ cells.value / _or_one(information), information
+    is_force = (bins.block == FORCE_BLOCK)[:, None] & (bins.channel[:, None] % 3 == axis)
+    elapsed = torch.where(is_force, (bins.time - bins.time.min())[:, None], 0.0)
+    noise_covariance, uncertain = expected_covariance(fitted, k)
+    solved = torch.linalg.solve(noise_covariance + uncertain @ uncertain.mT, elapsed)
+    information = (solved * elapsed).sum(0)
+    return solved.mT @ bins.value / _one_if_zero(information), information
 
 
-def _pooled(rate: Tensor, variance: Tensor) -> tuple[float, float, float]:
-    """(mean, standard error, its degrees of freedom) by what motions are known to and what they differ by."""
-    known = 1 / variance
-    over = (known * (rate - (known @ rate) / known.sum()) ** 2).sum() - (len(rate) - 1)
-    between = float(over / (known.sum() - known.square().sum() / known.sum()))
+def _pool_motions(rate: Tensor, variance: Tensor) -> tuple[float, float, float]:
+    """Return (mean, standard error, degrees of freedom) by within-motion variance and between-motion scatter."""
+    precision = 1 / variance
+    excess = (precision * (rate - (precision @ rate) / precision.sum()) ** 2).sum() - (len(rate) - 1)
+    between = float(excess / (precision.sum() - precision.square().sum() / precision.sum()))
     weight = 1 / (variance + max(0.0, between))
-    share = max(1 - float(weight.sum() / known.sum()), 1e-6)  # of the mean's variance, by what motions differ by
-    return float(weight @ rate / weight.sum()), float(weight.sum().rsqrt()), (len(rate) - 1) / share**2
-
-
-def _beyond(size: float, freedom: float) -> float:
-    """Chance that Student's t is farther from zero than this: with t = sqrt(n) tan(a), the integral of cos(a)^(n-1)."""
-    if freedom > 1e3:
-        return math.erfc(size / 2**0.5)
-    start, quarter = math.atan(size / freedom**0.5), 0.5 * math.pi
-    tail, whole = (torch.linspace(a, quarter, 10_001, dtype=torch.float64) for a in (start, 0.0))
-    area = lambda angle: float(torch.trapezoid(angle.cos().clamp(min=0.0) ** (freedom - 1), angle))  # noqa: E731
-    return area(tail) / area(whole)
+    scatter_fraction = max(1 - float(weight.sum() / precision.sum()), MIN_SCATTER_FRACTION)
+    mean, std = float(weight @ rate / weight.sum()), float(weight.sum().rsqrt())
+    return mean, std, (len(rate) - 1) / scatter_fraction**2

@@ -1,8 +1,8 @@
-"""Causes that change a law about whose number motions disagree, begun at their typical size.
+"""Candidates that change a law about whose parameter motions disagree, started at their typical amplitude.
 
-A law that differs along warp and weft, say, shows in each motion as another stiffness of one that does not: the fitted
-number is a mean of these, and slopes there ask for little. No straight line leads from it to the effect, but what lies
-between is seen when both are fitted anew from the effect's side.
+A law that differs along warp and weft shows in each motion as another stiffness of a law that does not. The fitted
+parameter is a mean of these, and slopes there ask for little. No straight line leads from it to the effect, but a fit
+that starts from the effect's side finds it.
 """
 
 from __future__ import annotations
@@ -10,33 +10,41 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 
-from ...episodes.world import Hypothesis, Model
-from ..causes.fabric import OF_BENDING, OF_MEMBRANE
-from .comparison import list_observed_motions, jackknife
+from ...episodes.world import Hypothesis, WorldModel
+from ..causes.fabric import BENDING_EFFECTS, MEMBRANE_EFFECTS
+from ..decide.criteria import CRITERIA
+from .comparison import jackknife, list_observed_motions
 from .fitting import ModelFit
 
-# by the number of a law: standard error by how motions differ, in logarithms, beyond which they disagree, and the
-# effects that change the law. In 115 sealed nulls the first is reached by two of bending and by none of the membrane
-LAWS = {"bending.stiffness": (0.15, OF_BENDING), "youngs_modulus": (0.075, OF_MEMBRANE)}
-FEWEST = 3  # motions, of which one may be the odd one
+EFFECTS_OF_PARAMETER = {"bending.stiffness": BENDING_EFFECTS, "youngs_modulus": MEMBRANE_EFFECTS}
 
 
-def propose_from_heterogeneity(found: ModelFit, names: Sequence[str], hypotheses: Sequence[Hypothesis]) -> list[tuple[Hypothesis, Model]]:
-    """Causes with the models to begin fits of them at, both ways where they have a sign; none, as a rule.
+def propose_from_heterogeneity(
+    fitted: ModelFit, motions: Sequence[str], hypotheses: Sequence[Hypothesis]
+) -> list[tuple[Hypothesis, WorldModel]]:
+    """Propose causes that change a law about whose parameter motions disagree; an empty list in most cases.
 
-    The number that is disputed is back at its data sheet, the others stay where they were fitted.
+    Args:
+        fitted: fit without the causes.
+        motions: label of each episode.
+        hypotheses: to choose from.
+
+    Returns:
+        The causes with the models to start their fits from, both ways if they have a sign. The parameter about which
+        motions disagree is back at its data sheet, the others stay where they were fitted.
     """
-    if len(set(list_observed_motions(found.whitened.episode, names))) < FEWEST:
+    criteria = CRITERIA.heterogeneity
+    if len(set(list_observed_motions(fitted.whitened.episode, motions))) < criteria.min_motions:
         return []
-    model, errors, out = found.model, jackknife(found, names)[1], []
-    for place, parameter in enumerate(model.parameters):
-        most, effects = LAWS.get(parameter.name, (float("inf"), ()))
-        if float(errors[place]) <= most:
+    model, std, proposed = fitted.model, jackknife(fitted, motions)[1], []
+    for k, parameter in enumerate(model.parameters):
+        if float(std[k]) <= criteria.max_log_std.get(parameter.name, float("inf")):
             continue
-        values = model.values.clone()
-        values[place] = 0.0
-        begun = replace(model, values=values)
-        for h in model.others(hypotheses):
-            if h.effect in effects:
-                out += [(h, begun.plus(h, way * h.typical)) for way in ((1.0, -1.0) if h.signed else (1.0,))]
-    return out
+        coordinates = model.coordinates.clone()
+        coordinates[k] = 0.0
+        start = replace(model, coordinates=coordinates)
+        for h in model.not_accepted(hypotheses):
+            if h.effect in EFFECTS_OF_PARAMETER.get(parameter.name, ()):
+                signs = (1.0, -1.0) if h.signed else (1.0,)
+                proposed += [(h, start.with_hypothesis(h, sign * h.typical)) for sign in signs]
+    return proposed

@@ -1,14 +1,17 @@
-"""How residuals of a true model err together: sensor, slow errors, and what differs from episode to episode.
+"""Covariance of the residuals of a correct model: sensor noise, slowly varying correlated errors, nuisances.
 
-    K = diag(spread^2 / n + r^2 / 2) + (level^2 + r^2 / 2) R + depth^2 d d' o S + N P N',  r = ROUGH rough
+    K = diag(s^2 / n + r^2 / 2) + (l^2 + r^2 / 2) R + q^2 d d' o S + N P N'
 
-R falls with distance on the fabric and with time, and so does S, over wider parts of an image: a camera's depths err
-slowly and together, and what that does to a cell depends on how the cloth faces the ray (d). N are the slopes along
-clock, camera, grasp, rim, tare and mesh (the difference between two, of which the truth may have more or less), and P
-their variances, so that these are neither fixed nor free. The levels, one for each kind of data, and the depths' come
-from restricted maximum likelihood after everything that is asked about is projected out: an effect must not pass as
-noise. How rough a stretch of time is (``evidence.gather``) is known beforehand; ripples neither agree with their
-neighbours nor do they not.
+with the scatter s of n rows in a bin, the level l of slow errors, the roughness r, the depth level q, and the slope d
+of a residual along the camera's depth. The correlation R falls with distance on the fabric and with time. S does the
+same over wider parts of an image, because errors of a camera's depth vary slowly, and their effect on a bin depends on
+how the cloth faces the ray. N are the slopes along clock, camera, grasp, rim, tare and mesh, and P their variances, so
+that these are neither fixed nor free. The mesh counts as a nuisance because the truth may differ from the fine mesh
+either way.
+
+Levels of each kind of data and of the depth are estimated by restricted maximum likelihood after all asked slopes are
+projected out, so that an effect does not pass as noise. The roughness of a time block is known beforehand (see
+``linearise``). Half of it counts as independent and half as correlated, because ripples are neither.
 """
 
 from __future__ import annotations
@@ -21,192 +24,251 @@ from torch import Tensor
 
 from ...errors import InvalidInput
 from ..data.binning import BLOCK_NAMES, FORCE_BLOCK, BinnedResiduals, average_groups, time_blocks
+from ..decide.criteria import CRITERIA
 from .linearise import FINE_MESH_ERROR_FRACTION, Linearisation
 
-REACH, MEMORY = 0.1, 0.3  # m, s, over which slow errors agree
-ACROSS = 0.3  # m, over which those of a camera's depths do
-FLOOR = {"points": 1e-4, "edges": 3e-4, "markers": 1e-4, "force": 5e-3, "torque": 5e-4}  # m, N, N m: of one cell
-DEPTH = 1e-4  # m, least slow error of depths
-UNFITTED = 5.0  # slow errors over their least size, to fit by: those of a model that is wrong yet say nothing
-ROUGH = 3.0  # steps along every parameter by which two engines' cloths may differ in effect
-RANK = 1e-9  # relative, of directions that count in the likelihood
+MIN_BIN_VARIANCE = 1e-14  # keeps the covariance positive definite where all rows of a bin are equal
 
 
 class Noise(NamedTuple):
-    """Levels of slow errors by kind of data, and of a camera's depths."""
+    """Levels of the slow errors.
 
-    levels: Tensor  # [blocks], in the data's units
-    depth_level: float = 0.0  # m
+    Attributes:
+        levels: [blocks] standard deviations by kind of data [m, N, N m].
+        depth_level: standard deviation of a camera's depth [m].
+    """
 
-    def covariance(self, cells: BinnedResiduals, nuisance: Tensor, std: Tensor, parts: CovarianceParts | None = None) -> Tensor:
-        """[C, C] of one episode; ``nuisance`` [C, N] slopes, ``std`` [N], ``parts`` of these cells if known."""
-        moved, known = nuisance * std, parts or CovarianceParts.compute(cells)
-        rough = 0.5 * known.rough_variance
-        slow = (self.levels[cells.block] ** 2 + rough).sqrt()
-        deep = self.depth_level * cells.depth_slope
-        agreed = slow[:, None] * known.correlation * slow + deep[:, None] * known.depth_correlation * deep
-        return torch.diag(known.variance + rough) + agreed + moved @ moved.mT
+    levels: Tensor
+    depth_level: float = 0.0
 
-    def smooth_fraction(self, cells: BinnedResiduals) -> Tensor:
-        """[C] share of the variance that is no roughness."""
-        smooth_variance = self.smooth_variance(cells)
-        return smooth_variance / (smooth_variance + _rough(cells))
+    def covariance(
+        self,
+        bins: BinnedResiduals,
+        nuisance_slopes: Tensor,
+        nuisance_stds: Tensor,
+        parts: CovarianceParts | None = None,
+    ) -> Tensor:
+        """Return the [B, B] covariance of one episode.
 
-    def smooth_variance(self, cells: BinnedResiduals) -> Tensor:
-        """[C] the other variance, but for what differs from episode to episode."""
-        return _white(cells) + self.levels[cells.block] ** 2 + (self.depth_level * cells.depth_slope) ** 2
+        Args:
+            bins: of the episode.
+            nuisance_slopes: [B, N] slopes along the nuisances.
+            nuisance_stds: [N] standard deviations of the nuisances.
+            parts: parts that do not depend on the levels, if known.
+        """
+        moved, parts = nuisance_slopes * nuisance_stds, parts or CovarianceParts.compute(bins)
+        half_roughness = 0.5 * parts.rough_variance
+        slow = (self.levels[bins.block] ** 2 + half_roughness).sqrt()
+        depth = self.depth_level * bins.depth_slope
+        correlated = slow[:, None] * parts.correlation * slow + depth[:, None] * parts.depth_correlation * depth
+        return torch.diag(parts.variance + half_roughness) + correlated + moved @ moved.mT
+
+    def smooth_fraction(self, bins: BinnedResiduals) -> Tensor:
+        """Return [B] the fraction of the variance that is not roughness."""
+        smooth = self.smooth_variance(bins)
+        return smooth / (smooth + _rough_variance(bins))
+
+    def smooth_variance(self, bins: BinnedResiduals) -> Tensor:
+        """Return [B] the variance without roughness and without nuisances."""
+        return _sensor_variance(bins) + self.levels[bins.block] ** 2 + (self.depth_level * bins.depth_slope) ** 2
 
 
 class CovarianceParts(NamedTuple):
-    """Of one episode's covariance, what no level changes."""
+    """Parts of one episode's covariance that do not depend on the levels.
 
-    variance: Tensor  # [C]
-    rough_variance: Tensor  # [C]
-    correlation: Tensor  # [C, C]
-    depth_correlation: Tensor  # [C, C]
+    Attributes:
+        variance: [B] variance of the mean by the scatter of rows.
+        rough_variance: [B] variance by roughness.
+        correlation: [B, B] of slow errors.
+        depth_correlation: [B, B] of depth errors.
+    """
+
+    variance: Tensor
+    rough_variance: Tensor
+    correlation: Tensor
+    depth_correlation: Tensor
 
     @staticmethod
-    def compute(cells: BinnedResiduals) -> CovarianceParts:
-        """Computed."""
-        return CovarianceParts(_white(cells), _rough(cells), _together(cells), _fading(cells, ACROSS))
+    def compute(bins: BinnedResiduals) -> CovarianceParts:
+        """Compute the parts of one episode's bins."""
+        depth_correlation = _decay(bins, CRITERIA.noise.depth_error_length_m)
+        return CovarianceParts(_sensor_variance(bins), _rough_variance(bins), _correlation(bins), depth_correlation)
 
 
 def minimal_noise() -> Noise:
-    """The sensor's and hardly more."""
-    return Noise(torch.tensor([FLOOR[name] for name in BLOCK_NAMES], dtype=torch.float64), DEPTH)
+    """Return the smallest levels, hardly more than the sensor's."""
+    criteria = CRITERIA.noise
+    levels = torch.tensor([criteria.min_slow_error[name] for name in BLOCK_NAMES], dtype=torch.float64)
+    return Noise(levels, criteria.min_depth_error_m)
 
 
 def inflated_noise() -> Noise:
-    """To fit by, where residuals are mostly the model's."""
-    level, depth = minimal_noise()
-    return Noise(UNFITTED * level, UNFITTED * depth)
+    """Return the levels to fit by while residuals are mostly model error."""
+    levels, depth_level = minimal_noise()
+    factor = CRITERIA.noise.fitting_factor
+    return Noise(factor * levels, factor * depth_level)
 
 
 def cap_noise(noise: Noise) -> Noise:
-    """The smaller levels of these and of ``unfitted``: what a model leaves that may be wrong is not all noise."""
-    most = inflated_noise()
-    return Noise(torch.minimum(noise.levels, most.levels), min(noise.depth_level, most.depth_level))
+    """Return levels no larger than the inflated ones: residuals of a model that may be wrong are not all noise."""
+    cap = inflated_noise()
+    return Noise(torch.minimum(noise.levels, cap.levels), min(noise.depth_level, cap.depth_level))
 
 
 class WhitenedBins(NamedTuple):
-    """All episodes' cells in units in which a true model's are independent and of variance one."""
+    """Bins of all episodes in units in which those of a correct model are independent with variance one.
 
-    value: Tensor  # [C]
-    jacobian: Tensor  # [C, own + hypotheses]
-    episode: Tensor  # [C] int64
-    log_determinants: Tensor  # [E], of each covariance
-    cholesky_factors: list[Tensor]  # Cholesky factors
-    time_block: Tensor  # [C] of time, whose cells err together
-    row_weight: Tensor  # [C] by which rows were multiplied beyond that
+    Attributes:
+        value: [B] residuals.
+        jacobian: [B, coordinates + hypotheses] slopes.
+        episode: [B] int64, index of the episode.
+        log_determinants: [E] of each episode's covariance.
+        cholesky_factors: of each episode's covariance.
+        time_block: [B] time block, whose bins share a robust weight.
+        row_weight: [B] factor by which rows were multiplied after whitening.
+    """
+
+    value: Tensor
+    jacobian: Tensor
+    episode: Tensor
+    log_determinants: Tensor
+    cholesky_factors: list[Tensor]
+    time_block: Tensor
+    row_weight: Tensor
 
 
-def whiten(evidence: Linearisation, noise: Noise, parts: Sequence[CovarianceParts] | None = None) -> WhitenedBins:
-    """Cells and slopes by the inverse Cholesky factor of every episode's covariance; ``parts`` of it, if known.
+def whiten(result: Linearisation, noise: Noise, parts: Sequence[CovarianceParts] | None = None) -> WhitenedBins:
+    """Multiply residuals and slopes by the inverse Cholesky factor of every episode's covariance.
+
+    Args:
+        result: residuals and slopes.
+        noise: levels of the covariance.
+        parts: parts of the covariance of each episode, if known.
 
     Raises:
-        InvalidInput: no cell is left.
+        InvalidInput: no bin is left.
     """
-    if not any(len(cells.value) for cells in evidence.bins):
-        raise _nothing_left()
-    values, slopes, index, logs, roots = [], [], [], [], []
-    count = evidence.n_coordinates + len(evidence.hypotheses)
-    for k, (cells, std) in enumerate(zip(evidence.bins, evidence.nuisance_stds, strict=True)):
-        nuisance = torch.cat([cells.jacobian[:, count:], evidence.mesh_differences[k][:, None]], 1)
-        stds = torch.cat([std, std.new_tensor([FINE_MESH_ERROR_FRACTION])])
-        root = torch.linalg.cholesky(noise.covariance(cells, nuisance, stds, parts[k] if parts else None))
-        both = torch.cat([cells.value[:, None], cells.jacobian[:, :count]], 1)
-        both = torch.linalg.solve_triangular(root, both, upper=False)
-        values.append(both[:, 0])
-        slopes.append(both[:, 1:])
-        index.append(torch.full((len(cells.value),), k))
-        logs.append(2 * root.diagonal().log().sum())
-        roots.append(root)
-    value, log, stretch = torch.cat(values), torch.stack(logs), time_blocks(evidence.bins)
-    return WhitenedBins(value, torch.cat(slopes), torch.cat(index), log, roots, stretch, torch.ones_like(value))
+    if not any(len(bins.value) for bins in result.bins):
+        raise _no_bins_error()
+    values, slopes, index, log_determinants, factors = [], [], [], [], []
+    n_columns = result.n_coordinates + len(result.hypotheses)
+    for k, (bins, stds) in enumerate(zip(result.bins, result.nuisance_stds, strict=True)):
+        nuisance_slopes = torch.cat([bins.jacobian[:, n_columns:], result.mesh_differences[k][:, None]], 1)
+        nuisance_stds = torch.cat([stds, stds.new_tensor([FINE_MESH_ERROR_FRACTION])])
+        covariance = noise.covariance(bins, nuisance_slopes, nuisance_stds, parts[k] if parts else None)
+        factor = torch.linalg.cholesky(covariance)
+        columns = torch.cat([bins.value[:, None], bins.jacobian[:, :n_columns]], 1)
+        columns = torch.linalg.solve_triangular(factor, columns, upper=False)
+        values.append(columns[:, 0])
+        slopes.append(columns[:, 1:])
+        index.append(torch.full((len(bins.value),), k))
+        log_determinants.append(2 * factor.diagonal().log().sum())
+        factors.append(factor)
+    value = torch.cat(values)
+    return WhitenedBins(
+        value=value,
+        jacobian=torch.cat(slopes),
+        episode=torch.cat(index),
+        log_determinants=torch.stack(log_determinants),
+        cholesky_factors=factors,
+        time_block=time_blocks(result.bins),
+        row_weight=torch.ones_like(value),
+    )
 
 
-def fit_noise(evidence: Linearisation, sweeps: int = 2) -> Noise:
-    """Levels by restricted maximum likelihood, one kind of data after the other on a grid of factors."""
-    found = minimal_noise()
-    present = torch.cat([c.block for c in evidence.bins]).unique().tolist()
-    if any(bool(c.depth_slope.any()) for c in evidence.bins):
-        present.append(None)
+def fit_noise(result: Linearisation, sweeps: int = 2) -> Noise:
+    """Estimate the levels by restricted maximum likelihood, one kind of data after the other on a grid of factors.
+
+    Args:
+        result: residuals and slopes; all slopes are projected out.
+        sweeps: passes over the kinds of data, the first on a coarse grid, the others on a fine one.
+    """
+    noise = minimal_noise()
+    blocks: list[int | None] = torch.cat([bins.block for bins in result.bins]).unique().tolist()
+    if any(bool(bins.depth_slope.any()) for bins in result.bins):
+        blocks.append(None)  # the depth level
     else:
-        found = found._replace(depth=0.0)
-    parts = [CovarianceParts.compute(cells) for cells in evidence.bins]
+        noise = noise._replace(depth_level=0.0)
+    parts = [CovarianceParts.compute(bins) for bins in result.bins]
     factors = 10 ** torch.linspace(-0.5, 1.75, 10, dtype=torch.float64)
     for sweep in range(sweeps):
-        for b in present:
-            own = float(found.depth_level if b is None else found.levels[b])
-            tried = (own * (factors if sweep == 0 else factors[:5] ** 0.3)).tolist()
-            found = max((_with(found, b, v) for v in tried), key=lambda n: _likelihood(evidence, n, parts))
-    return found
+        for b in blocks:
+            level = float(noise.depth_level if b is None else noise.levels[b])
+            grid = (level * (factors if sweep == 0 else factors[:5] ** 0.3)).tolist()
+            noise = max(
+                (_with_level(noise, b, v) for v in grid), key=lambda n: _restricted_likelihood(result, n, parts)
+            )
+    return noise
 
 
-def _with(noise: Noise, block: int | None, value: float) -> Noise:
-    """With another level of one kind of data; None: of depths."""
+def _with_level(noise: Noise, block: int | None, value: float) -> Noise:
+    """Replace the level of one kind of data; None: of the depth."""
     if block is None:
-        return noise._replace(depth=value)
-    level = noise.levels.clone()
-    level[block] = value
-    return noise._replace(level=level)
+        return noise._replace(depth_level=value)
+    levels = noise.levels.clone()
+    levels[block] = value
+    return noise._replace(levels=levels)
 
 
-def _likelihood(evidence: Linearisation, noise: Noise, parts: Sequence[CovarianceParts]) -> float:
-    """Restricted log-likelihood, all that is asked about projected out."""
-    found = whiten(evidence, noise, parts)
-    scale = found.jacobian.norm(dim=0).clamp(min=1e-12)
-    u, s, _ = torch.linalg.svd(found.jacobian / scale, full_matrices=False)
-    u, s = u[:, s > RANK * s[0]], s[s > RANK * s[0]]
-    left = found.value - u @ (u.mT @ found.value)
-    restricted = 2 * (s.log().sum() + scale.log().sum())
-    return float(-0.5 * (found.log_determinants.sum() + restricted + left @ left))
+def _restricted_likelihood(result: Linearisation, noise: Noise, parts: Sequence[CovarianceParts]) -> float:
+    whitened = whiten(result, noise, parts)
+    scale = whitened.jacobian.norm(dim=0).clamp(min=1e-12)
+    u, s, _ = torch.linalg.svd(whitened.jacobian / scale, full_matrices=False)
+    has_rank = s > CRITERIA.noise.rank_tolerance * s[0]
+    u, s = u[:, has_rank], s[has_rank]
+    residual = whitened.value - u @ (u.mT @ whitened.value)
+    restriction = 2 * (s.log().sum() + scale.log().sum())
+    return float(-0.5 * (whitened.log_determinants.sum() + restriction + residual @ residual))
 
 
-def _white(cells: BinnedResiduals) -> Tensor:
-    """[C] variance of each mean by what rows of a cell differ by, pooled over a kind of data."""
-    out = torch.zeros_like(cells.value)
-    for b in cells.block.unique():
-        own = cells.block == b
-        out[own] = cells.row_std[own].square().median() / cells.count[own]
-    return out + 1e-14
+def _sensor_variance(bins: BinnedResiduals) -> Tensor:
+    """Return [B] the variance of each mean by the scatter of its rows, pooled over a kind of data."""
+    out = torch.zeros_like(bins.value)
+    for b in bins.block.unique():
+        is_block = bins.block == b
+        out[is_block] = bins.row_std[is_block].square().median() / bins.count[is_block]
+    return out + MIN_BIN_VARIANCE
 
 
-def _rough(cells: BinnedResiduals) -> Tensor:
-    """[C] mean square over each stretch."""
-    return average_groups(time_blocks([cells]), (ROUGH * cells.roughness).square())
+def _rough_variance(bins: BinnedResiduals) -> Tensor:
+    """Return [B] the mean square roughness of each time block."""
+    return average_groups(time_blocks([bins]), (CRITERIA.noise.roughness_steps * bins.roughness).square())
 
 
-def _together(cells: BinnedResiduals) -> Tensor:
-    """[C, C] correlation of slow errors: of one kind and axis, all that is seen or what one gripper feels."""
-    same = (cells.block[:, None] == cells.block) & (cells.channel[:, None] % 3 == cells.channel % 3)
-    seen = cells.block < FORCE_BLOCK
-    alike = (seen[:, None] & seen) | (cells.channel[:, None] == cells.channel)
-    return torch.where(same & alike, _fading(cells, REACH), 0.0)
+def _correlation(bins: BinnedResiduals) -> Tensor:
+    """Return [B, B] of slow errors: those of one kind and axis, if seen or measured by one gripper, are correlated."""
+    same_kind = (bins.block[:, None] == bins.block) & (bins.channel[:, None] % 3 == bins.channel % 3)
+    is_position = bins.block < FORCE_BLOCK
+    same_sensor = (is_position[:, None] & is_position) | (bins.channel[:, None] == bins.channel)
+    return torch.where(same_kind & same_sensor, _decay(bins, CRITERIA.noise.slow_error_length_m), 0.0)
 
 
-def _fading(cells: BinnedResiduals, reach: float) -> Tensor:
-    """[C, C] from 1 towards 0 with distance on the fabric, of which what is felt has none, and with time."""
-    where = torch.cdist(cells.rest_position, cells.rest_position).square() / (2 * reach**2)
-    return torch.exp(-where - (cells.time[:, None] - cells.time).abs() / MEMORY)
+def _decay(bins: BinnedResiduals, length: float) -> Tensor:
+    """Return [B, B] from 1 to 0 with distance on the fabric, which is zero between forces, and with time."""
+    distance = torch.cdist(bins.rest_position, bins.rest_position).square() / (2 * length**2)
+    return torch.exp(-distance - (bins.time[:, None] - bins.time).abs() / CRITERIA.noise.slow_error_time_s)
 
 
-def compute_noise_floor(evidence: Linearisation, noise: Noise) -> float:
-    """RMS [m] of a position cell that a true model would leave, once an episode's nuisances are taken out."""
+def compute_noise_floor(result: Linearisation, noise: Noise) -> float:
+    """Return the RMS [m] that a correct model leaves of a position bin, without an episode's nuisances.
+
+    Raises:
+        InvalidInput: no position bin is left.
+    """
     total, count = 0.0, 0
-    for cells in evidence.bins:
-        own = cells.block < FORCE_BLOCK
-        variance = noise.smooth_variance(cells)[own]
-        total, count = total + float(variance.sum()), count + int(own.sum())
+    for bins in result.bins:
+        is_position = bins.block < FORCE_BLOCK
+        variance = noise.smooth_variance(bins)[is_position]
+        total, count = total + float(variance.sum()), count + int(is_position.sum())
     if not count:
-        raise _nothing_left()
+        raise _no_bins_error()
     return (total / count) ** 0.5
 
 
-def _nothing_left() -> InvalidInput:
+def _no_bins_error() -> InvalidInput:
     return InvalidInput(
         "episodes",
-        got="no place on the cloth that finer and coarser meshes and neighbouring values find alike",
+        got="no part of the cloth whose response is continuous, and the same on the fine mesh",
         expected="some",
         remedy="shorter or slower motions, with more of the cloth in view",
     )

@@ -1,9 +1,9 @@
-"""Would any course over time have done as well? A cause's slopes, exchanged between windows and motions, as placebos.
+"""Permutation test of a cause: would any other course over time have gained as much?
 
-What a cause does to the cells is kept as it is within a window, but goes to another window of another motion. Such a
-placebo has the cause's size and shape and cannot be what is wrong. What it gains on motions held out is chance. Of
-what is alike in all windows and motions, as of a camera that stands elsewhere, an exchange is the cause itself: such
-draws do not count, and where few are left nothing can be asked.
+The slopes of the cause are permuted as placebos: within a time window they stay as they are, but they go to another
+window of another motion. Such a placebo has the size and shape of the cause and cannot be what is wrong, so what it
+gains on held-out motions is chance. An effect that is the same in all windows and motions, such as a camera offset, is
+its own permutation. Such draws do not count, and if few are left the test is passed.
 """
 
 from __future__ import annotations
@@ -15,75 +15,93 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from ...episodes.world import Model
+from ...episodes.world import WorldModel
 from ..data.binning import BinnedResiduals, align_rows
+from ..decide.criteria import CRITERIA
 from .comparison import held_out_log_density
 from .fitting import ModelFit, robust_step
 from .noise import WhitenedBins
-from .robust_weights import reweight, remove_weights
-
-DRAWS, LEVEL = 40, 0.95
-ITSELF, FEWEST = 0.9, 10  # cosine with the cause, from which a draw is none; draws that must be left
+from .robust_weights import remove_weights, reweight
 
 
 class PermutationTest(NamedTuple):
-    """Log density that is gained on motions held out, where slopes hold all the way."""
+    """Result of a permutation test: linearised gains in log density on held-out motions.
 
-    gain: float  # by the cause
-    quantile_95: float  # what 95 % of the placebos stay below; 0 where there are none
+    Attributes:
+        gain: gain of the cause.
+        quantile_95: 95 % quantile of the permutations' gains; 0 if there were too few.
+    """
+
+    gain: float
+    quantile_95: float
 
     @property
     def is_passed(self) -> bool:
-        """The cause does what no other course would."""
+        """Whether the cause gains more than its permutations."""
         return self.gain > self.quantile_95
 
 
-def run_permutation_test(found: ModelFit, groups: Sequence[str], halved: Collection[str] = (), seed: int = 0) -> PermutationTest:
-    """Of the last accepted cause of a fitted model."""
-    rng = torch.Generator().manual_seed(seed)
-    plain, own = remove_weights(found.whitened), found.linearisation.n_coordinates
-    slopes, column = plain.jacobian[:, : own - 1], plain.jacobian[:, own - 1]
-    without = plain._replace(value=plain.value - found.model.amplitudes[-1] * column)
-    nothing = found.model.at(torch.cat([found.model.point[:-1], torch.zeros(1).to(found.model.point)]))
-    less = nothing.without(nothing.accepted[-1].name)
-    none = _held_out(found, without._replace(jacobian=slopes), less, groups, halved)
+def run_permutation_test(
+    fitted: ModelFit, motions: Sequence[str], halved: Collection[str] = (), seed: int = 0
+) -> PermutationTest:
+    """Test the last accepted cause of a fitted model.
 
-    def gain(change: Tensor) -> float:
-        white = without._replace(jacobian=torch.cat([slopes, change[:, None]], 1))
-        return _held_out(found, white, nothing, groups, halved) - none
+    Args:
+        fitted: a model with the cause.
+        motions: label of each episode.
+        halved: as in ``predict_held_out``.
+        seed: of the permutations.
+    """
+    criteria, generator = CRITERIA.permutation, torch.Generator().manual_seed(seed)
+    plain, n_coordinates = remove_weights(fitted.whitened), fitted.linearisation.n_coordinates
+    slopes, cause = plain.jacobian[:, : n_coordinates - 1], plain.jacobian[:, n_coordinates - 1]
+    without = plain._replace(value=plain.value - fitted.model.amplitudes[-1] * cause)
+    zero_amplitude = fitted.model.at_point(torch.cat([fitted.model.point[:-1], torch.zeros(1).to(fitted.model.point)]))
+    base_model = zero_amplitude.without_hypothesis(zero_amplitude.accepted[-1].name)
+    base = _linearised_density(fitted, without._replace(jacobian=slopes), base_model, motions, halved)
 
-    drawn = [_exchanged(found, own - 1, rng) for _ in range(DRAWS)]
-    others = [change for change in drawn if abs(torch.cosine_similarity(change, column, 0)) < ITSELF]
-    if len(others) < FEWEST:
-        return PermutationTest(gain(column), 0.0)
-    return PermutationTest(gain(column), float(torch.tensor([gain(change) for change in others]).quantile(LEVEL)))
+    def compute_gain(column: Tensor) -> float:
+        whitened = without._replace(jacobian=torch.cat([slopes, column[:, None]], 1))
+        return _linearised_density(fitted, whitened, zero_amplitude, motions, halved) - base
 
-
-def _held_out(found: ModelFit, white: WhitenedBins, model: Model, groups: Sequence[str], halved: Collection[str]) -> float:
-    """Log density of all motions, each by the others, of a model whose numbers go where one leap leads."""
-    step, _ = robust_step(white, model)
-    there = white._replace(value=white.value + white.jacobian @ step)
-    evidence = replace(found.linearisation, own=len(step))
-    return held_out_log_density(
-        replace(found, model=model.at(model.point + step), white=reweight(there), evidence=evidence), groups, halved
-    )
-
-
-def _exchanged(found: ModelFit, place: int, rng: torch.Generator) -> Tensor:
-    """[C] whitened slopes of a placebo, of either sign."""
-    cells = found.linearisation.bins
-    count = len(cells)
-    turn = int(torch.randint(1, count, (), generator=rng)) if count > 1 else 0
-    sign = 1 - 2 * int(torch.randint(2, (), generator=rng))
-    raw = [sign * _from(c, cells[(k + turn) % count], place, rng) for k, c in enumerate(cells)]
-    roots = found.whitened.cholesky_factors
-    return torch.cat(
-        [torch.linalg.solve_triangular(r, v[:, None], upper=False)[:, 0] for r, v in zip(roots, raw, strict=True)]
-    )
+    permutations = [_permute(fitted, n_coordinates - 1, generator) for _ in range(criteria.draws)]
+    different = [p for p in permutations if abs(torch.cosine_similarity(p, cause, 0)) < criteria.max_cosine]
+    if len(different) < criteria.min_draws:
+        return PermutationTest(compute_gain(cause), 0.0)
+    gains = torch.tensor([compute_gain(p) for p in different])
+    return PermutationTest(compute_gain(cause), float(gains.quantile(criteria.quantile)))
 
 
-def _from(to: BinnedResiduals, donor: BinnedResiduals, place: int, rng: torch.Generator) -> Tensor:
-    """[C] slopes of the donor's cells in another order of the windows; zero where it has no such cell."""
-    order = torch.randperm(int(torch.cat([to.window, donor.window, to.window.new_zeros(1)]).max()) + 1, generator=rng)
-    key = to._replace(window=order[to.window]).key
-    return align_rows(key, donor.key, donor.jacobian[:, place])
+def _linearised_density(
+    fitted: ModelFit, whitened: WhitenedBins, model: WorldModel, motions: Sequence[str], halved: Collection[str]
+) -> float:
+    """Return the held-out log density of a model after one robust step."""
+    step, _ = robust_step(whitened, model)
+    moved = whitened._replace(value=whitened.value + whitened.jacobian @ step)
+    result = replace(fitted.linearisation, n_coordinates=len(step))
+    stepped = replace(fitted, model=model.at_point(model.point + step), whitened=reweight(moved), linearisation=result)
+    return held_out_log_density(stepped, motions, halved)
+
+
+def _permute(fitted: ModelFit, column: int, generator: torch.Generator) -> Tensor:
+    """Return [B] whitened slopes of a permutation, with a random sign."""
+    episodes = fitted.linearisation.bins
+    count = len(episodes)
+    shift = int(torch.randint(1, count, (), generator=generator)) if count > 1 else 0
+    sign = 1 - 2 * int(torch.randint(2, (), generator=generator))
+    raw = [
+        sign * _take_slopes(bins, episodes[(k + shift) % count], column, generator) for k, bins in enumerate(episodes)
+    ]
+    whitened = [
+        torch.linalg.solve_triangular(factor, slopes[:, None], upper=False)[:, 0]
+        for factor, slopes in zip(fitted.whitened.cholesky_factors, raw, strict=True)
+    ]
+    return torch.cat(whitened)
+
+
+def _take_slopes(target: BinnedResiduals, donor: BinnedResiduals, column: int, generator: torch.Generator) -> Tensor:
+    """Return [B] slopes of the donor with its windows in another order; zero where it has no such bin."""
+    n_windows = int(torch.cat([target.window, donor.window, target.window.new_zeros(1)]).max()) + 1
+    order = torch.randperm(n_windows, generator=generator)
+    key = target._replace(window=order[target.window]).key
+    return align_rows(key, donor.key, donor.jacobian[:, column])

@@ -1,8 +1,8 @@
-"""Causes tried from the data sheet, where the fitted model leads to none, and fits begun there anew.
+"""Candidates started from the data sheet, and fits restarted there.
 
-An effect bends the numbers that are fitted without it, until slopes there ask for little of it or point away from it.
-The data sheet does not know of the effect, and is often nearer. What pulls and what pushes need not be alike, so signed
-causes are asked about both ways.
+An effect shifts the parameters that are fitted without it, until slopes there ask for little of it or point away from
+it. The data sheet knows nothing of the effect, and is often nearer. Signed causes are tried both ways, because pulling
+and pushing may differ.
 """
 
 from __future__ import annotations
@@ -12,71 +12,91 @@ from dataclasses import replace
 
 import torch
 
-from ...episodes.world import Hypothesis, Model
-from ...episodes.world_cache import IMPOSSIBLE
-from ..data.dataset import Progress, DiagnosisData, prefix_progress
-from .fitting import ModelFit, fit, robust_step, robust_step_with, add_cause
-from .linearise import linearise_hypotheses, linearise
+from ...episodes.world import Hypothesis, WorldModel
+from ...episodes.world_cache import IMPOSSIBLE_WORLD_ERRORS
+from ..data.dataset import DiagnosisData, Progress, prefix_progress
+from ..decide.criteria import CRITERIA
+from .fitting import ModelFit, add_cause, fit, robust_step, robust_step_with
+from .linearise import linearise, linearise_hypotheses
 from .noise import inflated_noise, whiten
 from .warm_start import quadratic_warm_start
-
-WORTH_TRYING = 0.5  # of what the best promises
 
 
 def propose_from_prior(
     start: ModelFit,
-    setting: DiagnosisData,
+    data: DiagnosisData,
     hypotheses: Sequence[Hypothesis],
-    tried: int,
+    max_tried: int,
     progress: Progress = lambda _: None,
-    least: float = 0.0,
-) -> list[tuple[Hypothesis, Model]]:
-    """The ``tried`` causes that promise most, each with the model to which one joint step from the data sheet leads.
+    min_gain: float = 0.0,
+) -> list[tuple[Hypothesis, WorldModel]]:
+    """Propose the causes that promise most by one joint step from the data sheet.
 
-    Without those that promise little beside the best, or at most ``least`` in log density.
+    Args:
+        start: fit without the causes.
+        data: the episodes.
+        hypotheses: to choose from.
+        max_tried: largest number of causes.
+        progress: called with one line for each episode that is simulated.
+        min_gain: log density that a cause must promise. It must also promise a part of what the best one does.
+
+    Returns:
+        The causes, each with the model to which the step leads.
     """
-    sheet = replace(start.model, values=torch.zeros_like(start.model.values))
-    away = [h.opposite for h in hypotheses if h.reverses]
-    about = prefix_progress(progress, "from the data sheet, causes")
-    there = linearise(sheet, setting, hypotheses, about, start.linearisation)
-    back = linearise_hypotheses(there, sheet, setting, away, prefix_progress(progress, "from the data sheet, the other way"))
-    ways = [replace(start, model=sheet, evidence=evidence) for evidence in (there, back)]  # leaps ask for no more
-    promised = sorted((pair for found in ways for pair in _promises(found)), key=lambda pair: -pair[0])
+    sheet = replace(start.model, coordinates=torch.zeros_like(start.model.coordinates))
+    opposites = [h.opposite for h in hypotheses if h.is_reversible]
+    stage = prefix_progress(progress, "from the data sheet, causes")
+    forward = linearise(sheet, data, hypotheses, stage, start.linearisation)
+    stage = prefix_progress(progress, "from the data sheet, the other way")
+    backward = linearise_hypotheses(forward, sheet, data, opposites, stage)
+    # robust steps need no more of a fit than its model and linearisation
+    fits = [replace(start, model=sheet, linearisation=result) for result in (forward, backward)]
+    promised = sorted((row for fitted in fits for row in _expected_gains(fitted)), key=lambda row: -row[0])
     likely: dict[str, ModelFit] = {}
-    for gained, name, found in promised:
-        if gained > max(least, WORTH_TRYING * promised[0][0]):
-            likely.setdefault(name, found)
-    named = {h.name: h for h in hypotheses}
-    return [(named[name], add_cause(found, named[name])) for name, found in list(likely.items())[:tried]]
+    for gain, name, fitted in promised:
+        if gain > max(min_gain, CRITERIA.restart.min_relative_gain * promised[0][0]):
+            likely.setdefault(name, fitted)
+    by_name = {h.name: h for h in hypotheses}
+    return [(by_name[name], add_cause(fitted, by_name[name])) for name, fitted in list(likely.items())[:max_tried]]
 
 
 def refit_from_prior(
-    found: ModelFit, setting: DiagnosisData, hypotheses: Sequence[Hypothesis], progress: Progress = lambda _: None
+    fitted: ModelFit, data: DiagnosisData, hypotheses: Sequence[Hypothesis], progress: Progress = lambda _: None
 ) -> ModelFit | None:
-    """The same causes, fitted from the data sheet and asked about the others.
+    """Fit the same causes again from the data sheet, and linearise along the others.
 
-    None where that ends as far from it, or no world has the data sheet's numbers beside these causes.
-    A number that has left its data sheet made up for causes that were not known then, and may hide the next one now.
+    A parameter that has left its data sheet made up for causes that were not known then, and may hide the next one.
+
+    Args:
+        fitted: fit with causes.
+        data: the episodes.
+        hypotheses: all that are asked about.
+        progress: called with one line for each episode that is simulated.
+
+    Returns:
+        The fit; None if a parameter leaves its data sheet again, or if the data sheet's values cannot be simulated with
+        these causes.
     """
-    model = replace(found.model, values=torch.zeros_like(found.model.values))
-    left = model.others(hypotheses)
+    model = replace(fitted.model, coordinates=torch.zeros_like(fitted.model.coordinates))
+    others = model.not_accepted(hypotheses)
     try:
-        near, _ = quadratic_warm_start(model, setting, prefix_progress(progress, "causes, from the data sheet"))
-        anew = prefix_progress(progress, "causes, anew")
-        again = fit(near, setting, progress=anew, before=found.linearisation)
-        if again.model.strained:  # so that nobody asks what it says about the others
+        near, _ = quadratic_warm_start(model, data, prefix_progress(progress, "causes, from the data sheet"))
+        stage = prefix_progress(progress, "causes, anew")
+        refitted = fit(near, data, progress=stage, before=fitted.linearisation)
+        if refitted.model.strained_parameters:
             return None
-        return fit(again.model, setting, left, 0, anew, before=found.linearisation, here=again.linearisation)
-    except IMPOSSIBLE:
+        return fit(refitted.model, data, others, 0, stage, before=fitted.linearisation, here=refitted.linearisation)
+    except IMPOSSIBLE_WORLD_ERRORS:
         return None
 
 
-def _promises(found: ModelFit) -> list[tuple[float, str, ModelFit]]:
-    """(log density that a cause adds to what one leap should gain, its name, the fit), where the leap goes its way."""
-    white, out = whiten(found.linearisation, inflated_noise()), []
-    _, without = robust_step(white, found.model)
-    for j, h in enumerate(found.linearisation.hypotheses):
-        step, gained = robust_step_with(white, found.model.plus(h), found.linearisation.n_coordinates + j)
+def _expected_gains(fitted: ModelFit) -> list[tuple[float, str, ModelFit]]:
+    """Return (log density that a cause adds to one robust step, its name, the fit), where the step has its sign."""
+    whitened, out = whiten(fitted.linearisation, inflated_noise()), []
+    _, gain_without = robust_step(whitened, fitted.model)
+    for j, h in enumerate(fitted.linearisation.hypotheses):
+        column = fitted.linearisation.n_coordinates + j
+        step, gain = robust_step_with(whitened, fitted.model.with_hypothesis(h), column)
         if float(step[-1]) * h.typical > 0:
-            out.append((gained - without, h.name, found))
+            out.append((gain - gain_without, h.name, fitted))
     return out

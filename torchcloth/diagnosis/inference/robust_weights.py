@@ -1,12 +1,12 @@
-"""Stretches of time in which the simulation goes another way count for less.
+"""Robust weights of time blocks: blocks in which the simulation diverges from the recording count for less.
 
-Cloth that folds over, or ripples on the other side, is millimetres off until it comes back, and nothing smooth mends
-it. So what a model leaves is taken for noise of a level that differs from stretch to stretch: whitened, the n cells of
-a stretch follow a multivariate t-distribution, whose maximum solves least squares with weights
+Cloth that folds over, or ripples to the other side, is off by millimetres until it comes back, and no smooth change of
+the model explains it. So the whitened n bins of a time block follow a multivariate t distribution with f degrees of
+freedom, and their maximum likelihood solves least squares with weights
 
-    w = min(1, (FREEDOM + n) / (FREEDOM + Q)),   Q = sum of squares in the stretch
+    w = min(1, (f + n) / (f + Q)),   Q = sum of squares in the block
 
-(Lange, Little and Taylor 1989; a stretch that fits well counts as ever).
+(Lange, Little and Taylor 1989). A block that fits well has weight 1.
 """
 
 from __future__ import annotations
@@ -14,37 +14,43 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from ..decide.criteria import CRITERIA
 from .noise import WhitenedBins
 
-FREEDOM = 5.0  # degrees
 
+def reweight(whitened: WhitenedBins, step: Tensor | None = None) -> WhitenedBins:
+    """Replace the weights of all bins by those of their residuals.
 
-def reweight(white: WhitenedBins, step: Tensor | None = None) -> WhitenedBins:
-    """Cells weighted by stretch, and by nothing else: as they are, or after a ``step`` of the first coordinates."""
-    plain = remove_weights(white)
+    Args:
+        whitened: bins with any weights.
+        step: step of the first coordinates after which the residuals are taken; None: residuals as they are.
+    """
+    plain = remove_weights(whitened)
     value = plain.value if step is None else plain.value + plain.jacobian[:, : len(step)] @ step
-    share = t_weights(value, plain.time_block).sqrt()
-    return plain._replace(value=share * plain.value, jacobian=share[:, None] * plain.jacobian, share=share)
+    root = t_weights(value, plain.time_block).sqrt()
+    return plain._replace(value=root * plain.value, jacobian=root[:, None] * plain.jacobian, row_weight=root)
 
 
-def remove_weights(white: WhitenedBins) -> WhitenedBins:
-    """Cells as whitening left them."""
-    value, slopes = white.value / white.row_weight, white.jacobian / white.row_weight[:, None]
-    return white._replace(value=value, jacobian=slopes, share=torch.ones_like(value))
+def remove_weights(whitened: WhitenedBins) -> WhitenedBins:
+    """Return the bins as whitening left them."""
+    value, slopes = whitened.value / whitened.row_weight, whitened.jacobian / whitened.row_weight[:, None]
+    return whitened._replace(value=value, jacobian=slopes, row_weight=torch.ones_like(value))
 
 
-def t_weights(value: Tensor, stretch: Tensor) -> Tensor:
-    """[C] of whitened cells."""
-    count, square = _sums(value, stretch)
-    return ((FREEDOM + count) / (FREEDOM + square)).clamp(max=1.0)[stretch]
+def t_weights(value: Tensor, time_block: Tensor) -> Tensor:
+    """Return [B] the weights of whitened residuals ``value`` [B] in their time blocks [B]."""
+    t_dof = CRITERIA.robust.t_dof
+    count, square = _block_sums(value, time_block)
+    return ((t_dof + count) / (t_dof + square)).clamp(max=1.0)[time_block]
 
 
-def t_log_density(value: Tensor, stretch: Tensor) -> Tensor:
-    """[stretches] logarithms, up to a constant that depends on the number of cells alone."""
-    count, square = _sums(value, stretch)
-    return -0.5 * (FREEDOM + count) * torch.log1p(square / FREEDOM)
+def t_log_density(value: Tensor, time_block: Tensor) -> Tensor:
+    """Return [blocks] log densities, up to a constant that depends on the number of bins alone."""
+    t_dof = CRITERIA.robust.t_dof
+    count, square = _block_sums(value, time_block)
+    return -0.5 * (t_dof + count) * torch.log1p(square / t_dof)
 
 
-def _sums(value: Tensor, stretch: Tensor) -> tuple[Tensor, Tensor]:
-    zeros = value.new_zeros(int(stretch.max()) + 1)
-    return zeros.index_add(0, stretch, torch.ones_like(value)), zeros.index_add(0, stretch, value.square())
+def _block_sums(value: Tensor, time_block: Tensor) -> tuple[Tensor, Tensor]:
+    zeros = value.new_zeros(int(time_block.max()) + 1)
+    return zeros.index_add(0, time_block, torch.ones_like(value)), zeros.index_add(0, time_block, value.square())

@@ -1,4 +1,4 @@
-"""A model file as what a user needs of it: a layer, a world, a start for fits, a prediction."""
+"""Uses of a model file: a cloth, a world, a start for fits, a prediction."""
 
 from __future__ import annotations
 
@@ -12,33 +12,33 @@ import torch
 
 from ...cloth import Cloth
 from ...episodes.observed import DEFAULT_FRAME_RATE_HZ, Episode, build_episode
-from ...episodes.replay import Frames, each
-from ...episodes.steps import one_way, shifted
-from ...episodes.world import Model, World
-from ...episodes.world_cache import if_possible
+from ...episodes.replay import Frames, map_frames
+from ...episodes.steps import one_sided_steps, shift_model
+from ...episodes.world import World, WorldModel
+from ...episodes.world_cache import none_if_impossible
 from ...errors import InvalidInput
-from ...identification.episode_prediction import EpisodePrediction, with_errors
-from ...identification.io.saved_fit import read_saved
-from ...identification.result import START
+from ...identification.episode_prediction import EpisodePrediction, propagate_errors
+from ...identification.io.saved_fit import read_saved_fit
+from ...identification.result import START_MODEL_FILE_NAME
 from ...recordings import Recording
-from ...recordings.consistency import same_cloth, together
-from ...recordings.fingerprints import alike, mark
+from ...recordings.consistency import check_same_cloth, merge_scene
+from ...recordings.fingerprints import fingerprint, same_episode
 from ...recordings.size_checks import check_size
 from ..data.binning import finite_differences
 from ..data.dataset import MAX_CLOCK_DELAY_S
 from ..inference.episode_simulation import map_parallel
-from .model_file import ModelFile, load_model, of_fabric, read_model
+from .model_file import ModelFile, adopt_data_sheet, load_model, read_model
 
-TRIES = 5  # of drawing a world that there is, for each that is wanted
-TOLD = 0.5  # of the prior's width: a parameter that is known better is known from data
+MAX_DRAWS_PER_MODEL = 5  # of a model for which there is a world
+MAX_FRACTION_OF_PRIOR_STD = 0.5  # a parameter with a smaller standard error is determined by data
 
 
 def load(path: str | Path) -> Cloth:
-    """The model of a ``.tcm`` file as a layer, with its fitted values and effects, ready to be called with motions.
+    """Load the model of a ``.tcm`` file as a cloth, with its fitted values and effects.
 
-    What the robot and the observer do otherwise is no part of a cloth: ``diagnosis.load_world`` has both beside it.
-    Where a cause has moved the patches that are held, vertices lie elsewhere on the pattern (``mesh.uv``) than an
-    episode's; ``identification.episode`` carries its first shape over.
+    Errors of the robot and the observer are no part of a cloth: ``diagnosis.load_world`` has them as well. If a cause
+    has moved the grasped patches, vertices lie elsewhere on the pattern (``mesh.uv``) than an episode's.
+    ``identification.episode`` interpolates its initial shape.
 
     Raises:
         InvalidInput: no such file, or a cause that is not in the catalogue.
@@ -48,120 +48,156 @@ def load(path: str | Path) -> Cloth:
 
 
 def load_world(path: str | Path) -> World:
-    """``cloth``, ``motions`` (what the robot really does), ``views`` (what the observer sees); raises as ``load``."""
-    return load_model(path).world()
+    """Load a model file as a world: its cloth, and what robot and observer do wrong; raises as ``load``."""
+    return load_model(path).build_world()
 
 
-def cloth_for(path: str | Path, recording: Recording) -> Cloth:
-    """The model's fabric and effects in the mesh, grasps and tables of an episode.
+def load_cloth_for(path: str | Path, recording: Recording) -> Cloth:
+    """Load the model's fabric and effects with the mesh, grasps and tables of an episode.
+
+    Args:
+        path: model file.
+        recording: the episode.
 
     Raises:
         InvalidInput: as ``load``, or an episode with another fabric.
         RecordingError: as ``load``.
     """
-    return read_model(path, recording).model.world().cloth.requires_grad_(True)
+    return read_model(path, recording).model.build_world().cloth.requires_grad_(True)
 
 
-def start_of(fit: str | Path) -> Callable[[Recording], Cloth] | None:
-    """Makes an episode's cloth of the model that a saved fit of ``identify --model`` began with; None: it had none.
+def make_start_builder(fit: str | Path) -> Callable[[Recording], Cloth] | None:
+    """Return a function that builds an episode's cloth from the model that a saved fit started from.
 
     Args:
-        fit: identification.json, or the folder that holds it.
+        fit: identification.json, or its folder.
+
+    Returns:
+        The function; None if the fit did not start from a model file (``identify --model``).
 
     Raises:
-        InvalidInput: there is no such file.
-        RecordingError: it cannot be read, or does not hold what is needed.
+        InvalidInput: no such file.
+        RecordingError: a file that cannot be read, or without what is needed.
     """
-    if not read_saved(fit).begun:
+    if not read_saved_fit(fit).has_start_model:
         return None
     folder = Path(fit) if Path(fit).is_dir() else Path(fit).parent
-    return partial(cloth_for, folder / START)
+    return partial(load_cloth_for, folder / START_MODEL_FILE_NAME)
 
 
-def beside_the_cloth(model: Model) -> dict[str, float]:
-    """Amplitudes of accepted causes that are in robot or observer and not in the cloth."""
-    found, world = {}, model.base  # each once: a patch that is wider already may have no room to be wider yet
-    for h, amplitude in zip(model.accepted, model.amplitudes, strict=True):
-        if h.applied(world, amplitude).cloth is world.cloth:
-            found[h.name] = amplitude
-    return found
+def list_causes_outside_cloth(model: WorldModel) -> dict[str, float]:
+    """Return the amplitudes of accepted causes that are in the robot or the observer and not in the cloth."""
+    # each cause is applied alone: a patch that is wider already may have no room to be wider
+    causes, world = zip(model.accepted, model.amplitudes, strict=True), model.base
+    return {h.name: amplitude for h, amplitude in causes if h.apply_to(world, amplitude).cloth is world.cloth}
 
 
-def uncertain(file: ModelFile) -> dict[str, tuple[float, float]]:
-    """By name of the cloth's own parameters that data determine: (value, spread), as the priors of ``identify``."""
-    from ...episodes.unknowns import available
+def derive_priors(file: ModelFile) -> dict[str, tuple[float, float]]:
+    """Return priors of ``identify`` for the cloth's parameters that data have determined.
 
-    out = {}
+    Args:
+        file: a model file.
+
+    Returns:
+        (value, spread) by name: a factor for positive parameters, else a difference.
+    """
+    from ...episodes.unknowns import find_scalar_parameters
+
+    priors = {}
     if file.covariance is None:
-        return out
-    stds, cloth = file.covariance.diagonal().sqrt().tolist(), file.model.world().cloth
-    own = available(cloth)
-    for p, c, std in zip(file.model.parameters, file.model.values.tolist(), stds, strict=False):
-        if std < TOLD * p.std and p.name in own:
-            positive = cloth.get_submodule(own[p.name]).domain == "positive"
+        return priors
+    stds, cloth = file.covariance.diagonal().sqrt().tolist(), file.model.build_world().cloth
+    paths = find_scalar_parameters(cloth)
+    for p, c, std in zip(file.model.parameters, file.model.coordinates.tolist(), stds, strict=False):
+        if std < MAX_FRACTION_OF_PRIOR_STD * p.prior_std and p.name in paths:
+            is_positive = cloth.get_submodule(paths[p.name]).domain == "positive"
             up, value, down = p.value(c + std), p.value(c), p.value(c - std)
-            out[p.name] = (value, math.sqrt(up / down) if positive else abs(up - down) / 2)
-    return out
+            priors[p.name] = (value, math.sqrt(up / down) if is_positive else abs(up - down) / 2)
+    return priors
 
 
-def drawn_models(file: ModelFile, count: int, seed: int = 0) -> list[Model]:
-    """``count`` models: the file's, then with its numbers drawn from their joint errors, where a world has such.
+def draw_models(file: ModelFile, count: int, seed: int = 0) -> list[WorldModel]:
+    """Draw models from the joint errors of a file's numbers; the first one is the file's model.
 
-    A residual force, whose errors nobody knows, stays.
+    A residual force, whose errors are not known, stays.
+
+    Args:
+        file: a model file.
+        count: number of models.
+        seed: of the draws.
 
     Raises:
-        InvalidInput: several are asked for and the file has no errors, or hardly any number within them has a world.
+        InvalidInput: several models of a file without errors, or errors within which hardly any world exists.
     """
-    model, rng, out = file.model, torch.Generator().manual_seed(seed), [file.model]
+    model, generator, models = file.model, torch.Generator().manual_seed(seed), [file.model]
     if count > 1 and file.covariance is None:
         raise InvalidInput("draws", got=f"{count} of a model without errors", expected="1, or a model with them")
-    for _ in range(TRIES * count):
-        if len(out) >= count or file.covariance is None:
-            return out
+    for _ in range(MAX_DRAWS_PER_MODEL * count):
+        if len(models) >= count or file.covariance is None:
+            return models
         values, vectors = torch.linalg.eigh(file.covariance)
-        noise = vectors * values.clamp(min=0.0).sqrt() @ torch.randn(len(values), generator=rng, dtype=values.dtype)
-        drawn = model.at(model.point + torch.cat([noise, noise.new_zeros(len(model.point) - len(noise))]))
-        out += [] if if_possible(drawn.world) is None else [drawn]
-    raise InvalidInput("draws", got=f"{len(out)} of {count} for which there is a world", expected="fewer draws")
+        standard = torch.randn(len(values), generator=generator, dtype=values.dtype)
+        noise = vectors * values.clamp(min=0.0).sqrt() @ standard
+        drawn = model.at_point(model.point + torch.cat([noise, noise.new_zeros(len(model.point) - len(noise))]))
+        models += [] if none_if_impossible(drawn.build_world) is None else [drawn]
+    raise InvalidInput("draws", got=f"{len(models)} of {count} for which there is a world", expected="fewer draws")
 
 
 def was_fitted(path: str | Path, recording: Recording) -> bool:
-    """Whether a model was fitted to this episode; raises as ``read_model``."""
-    own = mark(recording)
-    return any(alike(kept, own) for kept in read_model(path).episodes)
+    """Check whether a model was fitted to this episode; raises as ``read_model``."""
+    episode = fingerprint(recording)
+    return any(same_episode(other, episode) for other in read_model(path).episodes)
 
 
-def begin_with(path: str | Path, recordings: Sequence[Recording]) -> tuple[Model, list[Recording]]:
-    """A model file for ``diagnose``: its fabric and causes in the mesh, grasps and tables of episodes.
+def start_from_model(path: str | Path, recordings: Sequence[Recording]) -> tuple[WorldModel, list[Recording]]:
+    """Prepare a model file as the start of ``diagnose``, with the mesh, grasps and tables of episodes.
 
-    Without its residual force, which is no cause. The episodes come back with the data sheet that the model's numbers
-    are relative to. Raises as ``read_model``, or InvalidInput for episodes of two scenes.
+    Its residual force, which is no cause, is left out.
+
+    Args:
+        path: model file.
+        recordings: the episodes.
+
+    Returns:
+        The model, and the episodes with the data sheet that the model's numbers are relative to.
+
+    Raises:
+        InvalidInput: as ``read_model``, or episodes of different scenes.
+        RecordingError: as ``read_model``.
     """
-    same_cloth(recordings)
-    own = read_model(path).scene
-    told = [of_fabric(path, own, r) for r in recordings]
-    file = read_model(path, together(told), residual=False)
-    return replace(file.model, met=tuple(file.episodes)), told
+    check_same_cloth(recordings)
+    model_scene = read_model(path).scene
+    adopted = [adopt_data_sheet(path, model_scene, r) for r in recordings]
+    file = read_model(path, merge_scene(adopted), residual=False)
+    return replace(file.model, episode_fingerprints=tuple(file.episodes)), adopted
 
 
-def watched(world: World, data: Episode) -> Frames:
-    """What an observer whose clock may be late has of all of an episode's frames."""
-    return each(world.frames(data.with_lookahead(MAX_CLOCK_DELAY_S)), lambda field: field[: len(data.times)])
+def simulate_frames(world: World, data: Episode) -> Frames:
+    """Simulate what an observer, whose clock may be late, sees at all of an episode's frames."""
+    frames = world.simulate_observed(data.with_lookahead(MAX_CLOCK_DELAY_S))
+    return map_frames(frames, lambda field: field[: len(data.times)])
 
 
-def predicted(path: str | Path, recording: Recording) -> EpisodePrediction:
-    """Where the cloth goes in any episode, with errors from the covariance of the model's numbers.
+def predict_episode(path: str | Path, recording: Recording) -> EpisodePrediction:
+    """Predict an episode by a model file, with errors from the covariance of the model's numbers.
 
-    Robot and observer err as the model says. Where nothing was seen there are twenty frames a second. Raises as
-    ``cloth_for``, and for what was seen in another unit than metres.
+    Robot and observer err as the model says. If nothing was observed, there are twenty frames a second.
+
+    Args:
+        path: model file.
+        recording: the episode.
+
+    Raises:
+        InvalidInput: as ``load_cloth_for``, or observations in another unit than metres.
+        RecordingError: as ``load_cloth_for``.
     """
     check_size(recording)
     file = read_model(path, recording)
-    model, world = file.model, file.model.world()
-    data, every = build_episode(model.base.cloth, recording, DEFAULT_FRAME_RATE_HZ), one_way(model)
-    covariance = torch.zeros(len(every), len(every)) if file.covariance is None else file.covariance
-    shifts = every[: len(covariance)]  # a residual force, which comes last, has no errors
-    worlds = [world, *(shifted(model, k, step).world() for k, step in shifts)]
-    frames, *beside = map_parallel(lambda w: watched(w, data), worlds)
-    slopes = finite_differences(frames, beside, [step for _, step in shifts])
-    return with_errors(world.cloth, data, frames, slopes, covariance, math.nan)
+    model, world = file.model, file.model.build_world()
+    data, steps = build_episode(model.base.cloth, recording, DEFAULT_FRAME_RATE_HZ), one_sided_steps(model)
+    covariance = torch.zeros(len(steps), len(steps)) if file.covariance is None else file.covariance
+    steps = steps[: len(covariance)]  # a residual force, which comes last, has no errors
+    worlds = [world, *(shift_model(model, k, step).build_world() for k, step in steps)]
+    frames, *shifted = map_parallel(lambda w: simulate_frames(w, data), worlds)
+    slopes = finite_differences(frames, shifted, [step for _, step in steps])
+    return propagate_errors(world.cloth, data, frames, slopes, covariance, math.nan)

@@ -1,4 +1,4 @@
-"""What was measured over what the models simulate, in the moment in which the base model is farthest off."""
+"""Measured points and simulated cloth at the moment in which the base model is farthest off."""
 
 from __future__ import annotations
 
@@ -9,58 +9,71 @@ import torch
 from torch import Tensor
 
 from ...episodes.observed import Episode
-from ...losses import closest
-from ..data.binning import FORCE_BLOCK, BIN_SECONDS, BinnedResiduals
-from ..data.dataset import Progress, DiagnosisData
+from ...losses import find_closest_points
+from ..data.binning import BIN_SECONDS, FORCE_BLOCK, BinnedResiduals
+from ..data.dataset import DiagnosisData, Progress
 from ..decide.search import SearchResult
 from ..inference.episode_simulation import map_parallel
 
-FEWEST = 4  # points of a frame that is shown
+MIN_POINTS = 4  # of a frame that is shown
 
 
 class CloudOverlay(NamedTuple):
-    """One moment of one motion, as the observer sees it."""
+    """One moment of one motion, as the observer sees it.
+
+    Attributes:
+        motion: label of the motion.
+        time: from the first frame [s].
+        points: [N, 3] measured points [m].
+        surfaces: [V, 3] cloth [m] by the base model, then by the model with its causes, if it has any.
+        distances: [N] distance of the points from each surface [m].
+    """
 
     motion: str
-    time: float  # s, from the first frame
-    points: Tensor  # [N, 3] m, measured
-    surfaces: list[Tensor]  # [V, 3] m by the base model, then with its causes, if it has any
-    distances: list[Tensor]  # [N] m, of the points from each
+    time: float
+    points: Tensor
+    surfaces: list[Tensor]
+    distances: list[Tensor]
 
 
-def make_overlays(found: SearchResult, progress: Progress = lambda _: None) -> list[CloudOverlay]:
-    """Of every episode in which something was seen, on the given mesh."""
-    setting, faces = found.data, found.data.sheet.faces
-    worlds = [found.start.model.world(), *([found.end.model.world()] if found.accepted else [])]
-    moments = [_farthest(setting, k, cells) for k, cells in enumerate(found.start.linearisation.bins)]
-    shown = [(k, frame) for k, frame in enumerate(moments) if frame is not None]
+def make_overlays(result: SearchResult, progress: Progress = lambda _: None) -> list[CloudOverlay]:
+    """Simulate every episode with positions on the given mesh, and take the moment of the largest residual.
+
+    Args:
+        result: the search.
+        progress: called once, with the name of this stage.
+    """
+    data, faces = result.data, result.data.surface.faces
+    worlds = [result.start.model.build_world(), *([result.end.model.build_world()] if result.accepted else [])]
+    frames = [_find_worst_frame(data, k, bins) for k, bins in enumerate(result.start.linearisation.bins)]
+    shown = [(k, frame) for k, frame in enumerate(frames) if frame is not None]
     progress("pictures")
-    jobs = [partial(world.frames, setting.episodes[k], setting.dt) for k, _ in shown for world in worlds]
+    jobs = [partial(world.simulate_observed, data.episodes[k], data.dt) for k, _ in shown for world in worlds]
     simulated = iter(map_parallel(lambda job: job(), jobs))
-    out = []
+    overlays = []
     for k, frame in shown:
-        e = setting.episodes[k]
-        points, sheets = _measured(e, frame), [next(simulated).x[frame] for _ in worlds]
-        distances = [(points - closest(points, x, faces).on(x)).norm(dim=-1) for x in sheets]
-        out.append(CloudOverlay(setting.motions[k], float(e.times[frame] - e.times[0]), points, sheets, distances))
-    return out
+        e = data.episodes[k]
+        points, surfaces = _measured_points(e, frame), [next(simulated).x[frame] for _ in worlds]
+        distances = [(points - find_closest_points(points, x, faces).interpolate(x)).norm(dim=-1) for x in surfaces]
+        overlays.append(CloudOverlay(data.motions[k], float(e.times[frame] - e.times[0]), points, surfaces, distances))
+    return overlays
 
 
-def _farthest(setting: DiagnosisData, k: int, cells: BinnedResiduals) -> int | None:
-    """The frame in the middle of the stretch of time in which most is left of positions; None: none were seen."""
-    seen = cells.block < FORCE_BLOCK
-    if not bool(seen.any()):
+def _find_worst_frame(data: DiagnosisData, k: int, bins: BinnedResiduals) -> int | None:
+    """Return the frame in the middle of the time window with the largest position residual; None without positions."""
+    is_position = bins.block < FORCE_BLOCK
+    if not bool(is_position.any()):
         return None
-    e, window = setting.episodes[k], cells.window[seen]
-    left = torch.zeros(1 + int(window.max())).to(cells.value).index_add(0, window, cells.value[seen].square())
-    middle = (int((left / torch.bincount(window).clamp(min=1)).argmax()) + 0.5) * BIN_SECONDS
-    since = (e.times - e.times[0]).tolist()
-    told = [t for t in range(1, len(since)) if len(_measured(e, t)) >= FEWEST]
-    return min(told, key=lambda t: abs(since[t] - middle), default=None)
+    e, window = data.episodes[k], bins.window[is_position]
+    square = torch.zeros(1 + int(window.max())).to(bins.value).index_add(0, window, bins.value[is_position].square())
+    middle = (int((square / torch.bincount(window).clamp(min=1)).argmax()) + 0.5) * BIN_SECONDS
+    elapsed = (e.times - e.times[0]).tolist()
+    candidates = [t for t in range(1, len(elapsed)) if len(_measured_points(e, t)) >= MIN_POINTS]
+    return min(candidates, key=lambda t: abs(elapsed[t] - middle), default=None)
 
 
-def _measured(e: Episode, frame: int) -> Tensor:
-    """[N, 3] m, points, or markers where there are none."""
+def _measured_points(e: Episode, frame: int) -> Tensor:
+    """Return [N, 3] m the points of a frame, or the markers if there are no points."""
     if len(e.clouds[frame]) or e.markers is None:
         return e.clouds[frame]
     markers = e.markers[frame]

@@ -1,293 +1,274 @@
-"""report.html: one file that says what was found and shows why."""
+"""report.html: one file that says what a diagnosis concludes and shows why."""
 
 from __future__ import annotations
 
 import base64
-import html
 import io
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
+from datetime import date
+from importlib import metadata
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
+
+from jinja2 import Environment, PackageLoader, StrictUndefined
 
 from ..._utils.files import write_text
-from ..causes.glossary import ALIKE, GLOSSARY
+from ..causes.glossary import CAUSE_TITLES, EQUIVALENT_CAUSES, GLOSSARY
+from ..decide.criteria import CRITERIA
 from ..decide.verdict import Diagnosis
 from ..inference.screening import ScoreTest, screen
 from . import pictures
 from .cloud_pictures import draw_cloud_overlays
+from .wording import SECONDARY_LINES, VERDICTS, describe_next_step
 
-REPORT = "report.html"
-ASIDE = (
-    "Not there, or too small to matter",
-    "Would have to be",
-    "Undecided",
-    "Cannot be seen",
-    "Does nothing here",
-)  # lists of names
-STYLE = """
-body { font: 15px/1.5 system-ui, sans-serif; max-width: 62rem; margin: 2rem auto; padding: 0 1rem; color: #222 }
-h1 { font-size: 1.5rem } h2 { font-size: 1.15rem; margin-top: 2rem } img { max-width: 100% }
-table { border-collapse: collapse; font-size: 0.9rem } td, th { padding: 0.15rem 0.7rem; text-align: right }
-th { border-bottom: 1px solid #999 } td:first-child, th:first-child { text-align: left } .verdict { font-size: 1.3rem }
-"""
+REPORT_FILE = "report.html"
+TEMPLATE_FILE = "report.html.j2"
+FIGURE_DPI = 110
+NO_VALUE = "–"
+DISPLAY_UNITS = {"m": (1e3, "mm"), "N": (1e3, "mN"), "N m": (1e3, "mN m")}
+
+
+class Table(NamedTuple):
+    """A table of the report.
+
+    Attributes:
+        head: headings of the columns.
+        rows: (cells, whether the row is in bold) of each row.
+    """
+
+    head: Sequence[str]
+    rows: Sequence[tuple[Sequence[str], bool]]
 
 
 def write_report(answer: Diagnosis, folder: Path) -> Path:
-    """Write report.html into ``folder``; returns its path."""
-    verdict = [
-        f'<p class="verdict">Verdict: <b>{answer.verdict}</b></p>',
-        *_told(answer),
-    ]
-    parts = verdict if answer.optional_search is None else verdict + _evidence(answer)
-    title = "What the simulation gets wrong"
-    page = f"<!doctype html><html><head><meta charset='utf-8'><title>{title}</title><style>{STYLE}</style></head>"
-    return write_text(folder / REPORT, f"{page}<body><h1>{title}</h1>{''.join(parts)}</body></html>\n")
+    """Write report.html into a folder, and return its path.
 
-
-def _told(answer: Diagnosis) -> list[str]:
-    """The answer in words; what else was asked about is folded away."""
+    Args:
+        answer: the diagnosis.
+        folder: an existing folder.
+    """
+    environment = Environment(
+        loader=PackageLoader("torchcloth.diagnosis.report", ""),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
     lines = answer.summary().splitlines()
-    aside = [line for line in lines if line.startswith(ASIDE)]
-    out = [f"<p>{html.escape(line)}</p>" for line in lines if line not in aside]
-    if aside:
-        lists = "".join(f"<p>{html.escape(line)}</p>" for line in aside)
-        out.append(f"<details><summary>What else was asked about</summary>{lists}</details>")
-    return out
+    secondary = [line for line in lines if line.startswith(SECONDARY_LINES)]
+    context: dict[str, Any] = {
+        "verdict": answer.verdict,
+        "verdict_sentence": VERDICTS.get(answer.verdict, ""),
+        "next_step": describe_next_step(answer.verdict, answer.content),
+        "base_model": answer.content.get("base"),
+        "episodes": [e["name"] for e in answer.content.get("episodes", [])],
+        "version": metadata.version("torchcloth"),
+        "date": date.today().isoformat(),
+        "lines": [line for line in lines if line not in secondary and line not in VERDICTS.values()],
+        "secondary_lines": secondary,
+        "evidence": None if answer.optional_search is None else _collect_evidence(answer),
+    }
+    return write_text(folder / REPORT_FILE, environment.get_template(TEMPLATE_FILE).render(context) + "\n")
 
 
-def _evidence(answer: Diagnosis) -> list[str]:
-    """Pictures and tables of a search."""
-    found, content = answer.search, answer.content
-    before, after = found.held_out
-    first = screen(found.start)
-    rows = [*first, *found.scores]
-    named = _named(content, rows)
-    own = {r.hypothesis.effect: r.hypothesis.description for r in rows} | {c["effect"]: c["says"] for c in content["causes"]}
-    meanings = {name: said for name, said in own.items() if said} | GLOSSARY | ALIKE
-    instead = {n: c["effect"] for c in content["causes"] for n in (*c["class"], *(r["effect"] for r in c["rivals"]))}
-    return [
-        *_causes(content["causes"]),
-        *_over_cloud(answer),
-        "<h2>Where and when</h2>",
-        "<p>Means over parts of the fabric and 0.2 s, as a fit to all motions leaves them. Grey: not seen, or left out "
-        "because it jumps between shapes of the cloth.</p>",
-        _image(pictures.draw_residual_maps(answer), "Neither points nor markers were seen."),
-        "<h2>Motions held out</h2>",
-        "<p>Each motion is predicted from the others. Small errors of clock, camera and grip that differ between "
-        "episodes are taken out, so that a camera that stands elsewhere hardly shows here.</p>",
-        _image(pictures.draw_held_out_rms(answer, before, after if found.accepted else None)),
-        _gained(answer.content["gain"]),
-        "<h2>What the residuals of the base model ask for</h2>",
-        "<p>A first guess by slopes, which decides what is fitted, with 95 % intervals. The causes above are what fits "
-        "ended with.</p>",
-        _image(pictures.draw_scores(first)),
-        "<h2>What is left</h2>" if found.accepted else "<h2>All hypotheses</h2>",
-        _table(found.scores, instead),
-        "<h2>Lack of fit</h2>",
-        f"<p>{LACK}</p>",
-        _left(content["lack_of_fit"], pictures.wrap_labels(content)),
-        _drifts(answer.content["drifts"]),
-        *_missing(answer),
-        *_learned(answer.content["residual"]),
-        "<h2>What these motions can tell apart</h2>",
-        "<p>Dark: the two look alike in these data, by slopes. Which cannot be told apart by fits is said above.</p>",
-        _image(pictures.draw_correlations(answer), "Nothing that was asked about shows in them."),
-        "<h2>Parameters of the model</h2>",
-        _parameters(answer.content["parameters"]),
-        "<h2>What the names mean</h2>",
-        *(f"<p><b>{n}</b>: {html.escape(said)}</p>" for n, said in meanings.items() if n in named),
-    ]
+def _collect_evidence(answer: Diagnosis) -> dict[str, Any]:
+    """Return the figures and tables of a search."""
+    result, content = answer.search, answer.content
+    before, after = result.held_out
+    start_scores = screen(result.start)
+    scores = [*start_scores, *result.scores]
+    descriptions = {s.hypothesis.effect: s.hypothesis.description for s in scores}
+    descriptions |= {c["effect"]: c["description"] for c in content["causes"]}
+    meanings = {name: text for name, text in descriptions.items() if text} | GLOSSARY | EQUIVALENT_CAUSES
+    listed = _list_effects(content, scores)
+    overlays = None
+    if answer.overlays:
+        overlays = _encode_figure(draw_cloud_overlays(answer.overlays, result.data.surface.faces.numpy()))
+    residual_maps = pictures.draw_residual_maps(answer)
+    correlations = pictures.draw_correlations(answer)
+    missing = answer.missing_force
+    return {
+        "causes": _tabulate_causes(content["causes"]) if content["causes"] else None,
+        "overlays": overlays,
+        "residual_maps": None if residual_maps is None else _encode_figure(residual_maps),
+        "held_out_rms": _encode_figure(pictures.draw_held_out_rms(answer, before, after if result.accepted else None)),
+        "gain": None if content["gain"] is None else _tabulate_gain(content["gain"]),
+        "start_scores": _encode_figure(pictures.draw_scores(start_scores)),
+        "has_causes": bool(result.accepted),
+        "scores": _tabulate_scores(result.scores, content),
+        "min_displacement_mm": 1e3 * CRITERIA.screening.min_visible_displacement_m,
+        "max_rms_ratio": CRITERIA.adequacy.max_rms_ratio,
+        "max_p_value": CRITERIA.adequacy.max_p_value,
+        "lack_of_fit": _tabulate_lack_of_fit(content["lack_of_fit"], pictures.wrap_labels(content)),
+        "force_drifts": _tabulate_drifts(content["force_drifts"]) if content["force_drifts"] else None,
+        "missing_force": None if missing is None else _encode_figure(pictures.draw_missing_force(missing)),
+        "residual_force": _tabulate_laws(content["residual_force"]),
+        "correlations": None if correlations is None else _encode_figure(correlations),
+        "parameters": _tabulate_parameters(content["parameters"]),
+        "glossary": [(name, text) for name, text in meanings.items() if name in listed],
+    }
 
 
-def _named(content: Mapping[str, Any], screened: Sequence[ScoreTest]) -> set[str]:
-    """Effects that the report speaks of, without axes."""
-    names = {r.hypothesis.name for r in screened}
-    names |= {n for c in content["causes"] for n in (c["effect"], *c["class"], *(r["effect"] for r in c["rivals"]))}
+def _list_effects(content: Mapping[str, Any], scores: Sequence[ScoreTest]) -> set[str]:
+    """Return the effects that the report mentions, without axes."""
+    names = {s.hypothesis.name for s in scores}
+    for c in content["causes"]:
+        names |= {c["effect"], *c["equivalence_class"], *(r["effect"] for r in c["rivals"])}
     return {name.partition("[")[0] for name in names}
 
 
-def _causes(rows: list[dict[str, Any]]) -> list[str]:
-    """What is named: how large, how much it mends and how sure that is."""
-    if not rows:
-        return []
-
-    def told(c: dict[str, Any]) -> list[str]:
-        unit, (low, high), placebo = "" if c["unit"] == "-" else c["unit"], c["ci95"], c["placebo"]
-        chance = "–" if placebo["chance"] is None else f"{placebo['chance']:.1f}"
-        share = "–" if c["share_of_explainable"] is None else f"{100 * c['share_of_explainable']:.0f} %"
-        others = [n for n in c["class"] if n != c["effect"]] + [r["effect"] for r in c["rivals"]]
-        return [
-            c["effect"],
-            f"{c['amplitude']:.4g} {unit}",
-            f"{low:.4g} to {high:.4g}",
-            f"{c['amplitude'] / c['typical']:.2g}",
-            f"{c['gain_mm']:.2f}",
-            share,
-            f"{placebo['log_density']:.0f}",
-            chance,
-            ", ".join(dict.fromkeys(others)) or "nothing",
-        ]
-
-    head = (
-        "cause", "amplitude", "95 %", "of typical", "mends, mm", "of what is explainable", "log density",
-        "by chance", "cannot be told from",
-    )  # fmt: skip
-    return [
-        "<h2>Causes</h2>",
-        f"<p>{CAUSES}</p>",
-        _ruled(head, ((told(c), False) for c in rows)),
-    ]
-
-
-def _over_cloud(answer: Diagnosis) -> list[str]:
-    """The moments that were kept, if any."""
-    if not answer.overlays:
-        return []
-    faces = answer.search.data.sheet.faces.numpy()
-    told = (
-        "Of each episode the moment in which the base model is farthest off, with the mean distance of all its points, "
-        "also of those that count for nothing elsewhere because the cloth jumps."
-    )
-    return [
-        "<h2>Measured points over the simulation</h2>",
-        f"<p>{told}</p>",
-        _image(draw_cloud_overlays(answer.overlays, faces), alt="Measured points over the simulated cloth"),
-    ]
-
-
-def _gained(gain: dict[str, Any] | None) -> str:
-    """What all causes gain, motion by motion."""
-    if gain is None:
-        return ""
-
-    def told(row: dict[str, Any]) -> list[str]:
-        rms = ("–" if row[key] is None else f"{1e3 * row[key]:.2f}" for key in ("rms_before", "rms_after"))
-        share = _within(row["explained_fraction"], row["ci95"], 100.0)
-        return [row["motion"], *rms, share, _within(row["log_density"], row["log_density_ci95"])]
-
-    head = ("motion held out", "RMS before, mm", "after, mm", "% explained (95 %)", "log density gained (95 %)")
-    return _ruled(head, ((told(row), False) for row in gain["per_motion"]))
-
-
-def _within(value: float | None, ends: list[float] | None, factor: float = 1.0) -> str:
-    """A number with its interval, as far as they are known."""
-    if value is None:
-        return "–"
-    return f"{factor * value:.0f}" + ("" if ends is None else " ({:.0f} to {:.0f})".format(*(factor * e for e in ends)))
-
-
-def _image(figure: Any, otherwise: str = "", alt: str = "As the heading says") -> str:
-    if figure is None:
-        return f"<p>{otherwise}</p>"
+def _encode_figure(figure: Any) -> str:
+    """Return a figure as a data URI."""
     buffer = io.BytesIO()
-    figure.savefig(buffer, format="png", dpi=110)
-    return f'<img alt="{alt}" src="data:image/png;base64,{base64.b64encode(buffer.getvalue()).decode()}">'
+    figure.savefig(buffer, format="png", dpi=FIGURE_DPI)
+    return f"data:image/png;base64,{base64.b64encode(buffer.getvalue()).decode()}"
 
 
-COLUMNS = (
-    "hypothesis", "unit", "amplitude", "std. error", "shift by the mesh", "matters from", "shows from", "typical",
-    "typical moves, mm", "decision",
-)  # fmt: skip
-CAUSES = (
-    "Mends and log density: gained on motions that were held out; each unit of log density makes them e times "
-    "likelier. Log density is here by slopes, from the fit with all causes, so that it can be held against chance: "
-    "its own slopes, put in wrong places, would rarely gain more than the number beside it. By fits, as above, it is "
-    "another number."
-)
-LACK = (
-    "What a right model leaves: the sensor's slow errors, what another mesh changes, and ripples, which another cloth "
-    "has elsewhere. Where these are large, little can be called lacking."
-)
-DECISIONS = (
-    "Amplitude: what the residuals ask for. Present: surely larger than what matters. Absent: surely smaller than that "
-    "(not zero), or of a sign that makes no sense. Unresolvable: even a typical amplitude might not show, or would "
-    "move the cloth by less than 0.3 mm; an amplitude shows, in one of two cases, from the value in its column on. "
-    "Inconclusive: none of these. Typical moves: what a typical amplitude does to the cloth beyond what is fitted "
-    "anyway."
-)
+def _title(effect: str) -> str:
+    """Return the title and symbol of an effect, with its axis, and its name in the catalogue."""
+    name, _, axis = effect.partition("[")
+    if name not in CAUSE_TITLES:
+        return effect
+    along = f", {axis.rstrip(']')}" if axis else ""
+    return f"{CAUSE_TITLES[name]}{along} – {effect}"
 
 
-def _table(rows: list[ScoreTest], instead: dict[str, str]) -> str:
-    """``instead``: by name, the cause that is named for it as well."""
-    body = []
+def _tabulate_causes(causes: Sequence[Mapping[str, Any]]) -> Table:
+    head = (
+        "cause", "amplitude [95 %]", "of typical", "improves, mm", "explained fraction", "log density gain",
+        "95 % quantile of permutations", "confounded with",
+    )  # fmt: skip
+    rows = []
+    for c in causes:
+        unit, (low, high), test = "" if c["unit"] == "-" else f" {c['unit']}", c["ci95"], c["permutation_test"]
+        fraction = c["explained_fraction"]
+        others = [n for n in c["equivalence_class"] if n != c["effect"]] + [r["effect"] for r in c["rivals"]]
+        cells = (
+            _title(c["effect"]),
+            f"{c['amplitude']:.4g} [{low:.4g}, {high:.4g}]{unit}",
+            f"{c['amplitude'] / c['typical']:.2g}",
+            f"{c['rms_removed_mm']:.2f}",
+            NO_VALUE if fraction is None else f"{100 * fraction:.0f} %",
+            f"{test['log_density']:.0f}",
+            NO_VALUE if test["quantile_95"] is None else f"{test['quantile_95']:.1f}",
+            ", ".join(dict.fromkeys(others)) or "nothing",
+        )
+        rows.append((cells, False))
+    return Table(head, rows)
+
+
+def _tabulate_gain(gain: Mapping[str, Any]) -> Table:
+    head = ("held-out motion", "RMS before, mm", "after, mm", "% explained [95 %]", "log density gain [95 %]")
+    rows = []
+    for row in gain["per_motion"]:
+        rms = [NO_VALUE if row[key] is None else f"{1e3 * row[key]:.2f}" for key in ("rms_before", "rms_after")]
+        # where the base model is at the noise floor there is nothing to explain
+        has_misfit = row["rms_before"] is not None and row["rms_before"] > gain["noise_floor"]
+        fraction = row["explained_fraction"] if has_misfit else None
+        explained = _format_interval(fraction, row["explained_fraction_ci95"], 100.0)
+        rows.append(
+            ([row["motion"], *rms, explained, _format_interval(row["log_density"], row["log_density_ci95"])], False)
+        )
+    return Table(head, rows)
+
+
+def _format_interval(value: float | None, ends: Sequence[float] | None, factor: float = 1.0) -> str:
+    """Return a number with its interval, as far as they are known."""
+    if value is None:
+        return NO_VALUE
+    interval = "" if ends is None else " [{:.0f}, {:.0f}]".format(*(factor * end for end in ends))
+    return f"{factor * value:.0f}{interval}"
+
+
+def _tabulate_scores(scores: Sequence[ScoreTest], content: Mapping[str, Any]) -> Table:
+    head = (
+        "hypothesis", "unit", "amplitude", "standard error", "mesh error", "smallest effect of interest",
+        "detectable from", "typical", "a typical one moves, mm", "decision",
+    )  # fmt: skip
+    named_for = {
+        name: c["effect"]
+        for c in content["causes"]
+        for name in (*c["equivalence_class"], *(r["effect"] for r in c["rivals"]))
+    }
+    rows = []
+    for s in scores:
+        h = s.hypothesis
+        numbers = (
+            s.amplitude, s.std, s.mesh_bias, abs(h.smallest_of_interest), s.smallest_detectable, h.typical,
+            1e3 * s.position_rms,
+        )  # fmt: skip
+        decision = f"confounded with {named_for[h.name]}" if h.name in named_for else s.decision
+        cells = [h.name, h.unit, *(f"{x:.3g}" if math.isfinite(x) else NO_VALUE for x in numbers), decision]
+        if not math.isfinite(s.std):  # the hypothesis could not be tested
+            cells[2] = cells[4] = NO_VALUE
+        rows.append((cells, False))
+    return Table(head, rows)
+
+
+def _tabulate_lack_of_fit(rows: Sequence[Mapping[str, Any]], labels: Sequence[str]) -> Table:
+    """Return residuals by episode and kind of data, with those of a correct model; significant misfits in bold."""
+    head = ("motion", "data", "RMS", "expected", "of which mesh error", "", "ratio", "p-value")
+    out = []
     for r in rows:
-        h = r.hypothesis
-        numbers = (r.amplitude, r.std, r.mesh_bias, abs(h.smallest), r.smallest_detectable, h.typical, 1e3 * r.position_rms)
-        decision = f"not told from {instead[h.name]}" if h.name in instead else r.decision
-        cells = [h.name, h.unit, *(f"{x:.3g}" if math.isfinite(x) else "–" for x in numbers), decision]
-        if not math.isfinite(r.std):  # it could not be asked about
-            cells[2] = cells[4] = "–"
-        body.append("".join(f"<td>{html.escape(c)}</td>" for c in cells))
-    heads = "".join(f"<th>{name}</th>" for name in COLUMNS)
-    return f"<p>{DECISIONS}</p><table><tr>{heads}</tr>{''.join(f'<tr>{row}</tr>' for row in body)}</table>"
+        factor, unit = DISPLAY_UNITS[r["unit"]]
+        numbers = [f"{factor * r[key]:.2f}" for key in ("rms", "expected_rms", "mesh_rms")]
+        cells = [labels[r["episode"]], r["kind"], *numbers, unit, f"{r['rms_ratio']:.2f}", f"{r['p_value']:.2g}"]
+        out.append((cells, r["is_significant"]))
+    return Table(head, out)
 
 
-def _ruled(head: Sequence[str], rows: Iterable[tuple[Sequence[str], bool]]) -> str:
-    """A table of cells; rows that are marked stand in bold."""
-    body = ""
-    for cells, bold in rows:
-        tag = "th" if bold else "td"
-        body += f"<tr>{''.join(f'<{tag}>{html.escape(c)}</{tag}>' for c in cells)}</tr>"
-    return f"<table><tr>{''.join(f'<th>{h}</th>' for h in head)}</tr>{body}</table>"
-
-
-def _left(rows: list[dict[str, Any]], titles: list[str]) -> str:
-    """What remains, by episode and kind of data, beside what a right model would leave; lacking rows in bold."""
-
-    def told(r: dict[str, Any]) -> list[str]:
-        scale, unit = {"m": (1e3, "mm"), "N": (1e3, "mN"), "N m": (1e3, "mN m")}[r["unit"]]
-        numbers = [f"{scale * r[key]:.2f}" for key in ("left", "expected", "numerics")]
-        return [titles[r["episode"]], r["kind"], *numbers, unit, f"{r['ratio']:.2f}", f"{r['p']:.2g}"]
-
-    head = ("motion", "data", "left", "a right model leaves", "of which numerics", "", "ratio", "chance")
-    return _ruled(head, ((told(r), r["lacking"]) for r in rows))
-
-
-def _drifts(rows: list[dict[str, Any]]) -> str:
-    """What forces drift by in all motions alike; lacking rows in bold."""
-
-    def told(r: dict[str, Any]) -> list[str]:
-        return [f"force, {r['axis']}", f"{1e3 * r['rate']:.1f}", f"{1e3 * r['std']:.1f}", "mN/s", f"{r['p']:.2g}"]
-
-    head = ("in all motions alike", "grows by", "std. error", "", "chance")
-    return _ruled(head, ((told(r), r["lacking"]) for r in rows)) if rows else ""
-
-
-def _missing(answer: Diagnosis) -> list[str]:
-    if answer.missing_force is None:
-        return []
-    return [
-        "<h2>The force that is missing</h2>",
-        "<p>Beside the model and its causes, where and when it is the surest in each motion. Red: along the normal "
-        "u × v; arrows: along the cloth, where sure. Names no cause.</p>",
-        _image(pictures.draw_missing_force(answer.missing_force)),
-    ]
-
-
-def _learned(found: dict[str, Any] | None) -> list[str]:
-    """The laws of a residual force, if any was looked for."""
-    if found is None:
-        return []
-    title = "<h2>Laws without a cause</h2>"
-    if not found["terms"]:
-        return [title, "<p>No local law was found that would predict motions held out better.</p>"]
-    gain, head = found["gain"], ("law", "coefficient", "unit", "what it does")
-    terms = (([t["law"], f"{t['coefficient']:.3g}", t["unit"], t["told"]], False) for t in found["terms"])
-    return [
-        title,
-        f"<p>Local laws that were learned: {1e3 * gain['rms_before']:.2f} to {1e3 * gain['rms_after']:.2f} mm "
-        "on motions held out. They are part of the extended model and can be left out.</p>",
-        _ruled(head, terms),
-    ]
-
-
-def _parameters(found: dict[str, Any]) -> str:
-    rows = "".join(
-        f"<tr><td>{name}</td><td>{p['value']:.4g}</td><td>{p['ci95'][0]:.4g} to {p['ci95'][1]:.4g}</td>"
-        f"<td>{p['data_sheet']:.4g}</td><td>{p['unit']}</td></tr>"
-        for name, p in found.items()
+def _tabulate_drifts(rows: Sequence[Mapping[str, Any]]) -> Table:
+    """Return drifts of forces that are common to all motions; significant ones in bold."""
+    head = ("in all motions", "drift", "standard error", "", "p-value")
+    return Table(
+        head,
+        [
+            (
+                [
+                    f"force, {r['axis']}",
+                    f"{1e3 * r['rate']:.1f}",
+                    f"{1e3 * r['std']:.1f}",
+                    "mN/s",
+                    f"{r['p_value']:.2g}",
+                ],
+                r["is_significant"],
+            )
+            for r in rows
+        ],
     )
-    return (
-        f"<table><tr><th>parameter</th><th>value</th><th>95 %</th><th>data sheet</th><th>unit</th></tr>{rows}</table>"
+
+
+def _tabulate_laws(residual: Mapping[str, Any] | None) -> dict[str, Any] | None:
+    """Return the gain and the laws of a residual force; None if no laws were searched for."""
+    if residual is None:
+        return None
+    if not residual["terms"]:
+        return {"table": None}
+    head = ("law", "coefficient", "unit", "what it does")
+    rows = [([t["law"], f"{t['coefficient']:.3g}", t["unit"], t["description"]], False) for t in residual["terms"]]
+    gain = residual["gain"]
+    return {
+        "table": Table(head, rows),
+        "before_mm": f"{1e3 * gain['rms_before']:.2f}",
+        "after_mm": f"{1e3 * gain['rms_after']:.2f}",
+    }
+
+
+def _tabulate_parameters(parameters: Mapping[str, Any]) -> Table:
+    head = ("parameter", "value [95 %]", "data sheet", "unit")
+    return Table(
+        head,
+        [
+            (
+                [
+                    name,
+                    f"{p['value']:.4g} [{p['ci95'][0]:.4g}, {p['ci95'][1]:.4g}]",
+                    f"{p['data_sheet']:.4g}",
+                    p["unit"],
+                ],
+                False,
+            )
+            for name, p in parameters.items()
+        ],
     )

@@ -1,4 +1,4 @@
-"""Where on the fabric, in which motion and when a cause shows: what it moves beyond what fitted numbers could do."""
+"""Where on the fabric, in which motion and when a cause shows: its effect beyond what fitted parameters could do."""
 
 from __future__ import annotations
 
@@ -10,64 +10,77 @@ from torch import Tensor
 
 from ...episodes.observed import Episode
 from ...identification.residuals.blocks import BLOCKS
-from ..data.binning import FORCE_BLOCK, BIN_SECONDS
+from ..data.binning import BIN_SECONDS, FORCE_BLOCK
+from ..decide.criteria import CRITERIA
 from ..inference.fitting import ModelFit, posterior_precision
 
-SEEN_ENOUGH = 0.1  # of what all cells tell: from there on the place is one on the fabric
+EPISODE_WINDOW_SPACING = 1000  # between the window numbers of two episodes
 
 
-def localise_cause(found: ModelFit, name: str, names: Sequence[str], episodes: Sequence[Episode]) -> dict[str, Any]:
-    """The place and the stretch of time in which an accepted cause stands out of the noise most, and by how much.
+def localise_cause(fitted: ModelFit, name: str, motions: Sequence[str], episodes: Sequence[Episode]) -> dict[str, Any]:
+    """Return the place and the time window in which an accepted cause is most significant, and its effect there.
 
-    Of positions, unless forces tell nearly all, and of the kind of them that tells most.
+    Positions are used unless forces carry nearly all information, and of them the most informative kind of data.
 
     Args:
-        found: a model with the cause.
-        name: of the cause.
-        names: of the episodes' motions.
-        episodes: that it was fitted to.
+        fitted: a model with the cause.
+        name: name of the cause.
+        motions: label of each episode.
+        episodes: those that the model was fitted to.
 
     Returns:
-        "where": {"at": [u, v] m on the pattern} or {"gripper": name}; "when": {"episode", "motion", "from", "to"} s
-        from the first frame; "moves": {"value", "unit"} there, at the fitted amplitude.
+        "where": {"at": [u, v] on the pattern [m]} or {"gripper": name}; "when": {"episode", "motion", "from", "to"}
+        [s from the first frame]; "response": {"value", "unit"} there, at the fitted amplitude.
     """
-    cells = found.linearisation.bins
-    moved = torch.cat(_alone(found, name))
-    told = (moved / torch.cat([_scatter(found, k) for k in range(len(cells))])).square()
-    join = lambda field: torch.cat([getattr(c, field) for c in cells])  # noqa: E731
-    block, window, part, place = join("block"), join("window"), join("patch") // 3, join("place")
-    episode = torch.cat([torch.full_like(c.block, k) for k, c in enumerate(cells)])
-    chosen = block < FORCE_BLOCK
-    chosen = chosen if told[chosen].sum() > SEEN_ENOUGH * told.sum() else ~chosen
-    for column in (block, episode * 1000 + window, part):
-        chosen = chosen & (column == _most(column, told, chosen))
-    first = int(chosen.nonzero()[0])
+    all_bins = fitted.linearisation.bins
+    response = torch.cat(_compute_response(fitted, name))
+    scatter = torch.cat([_bin_std(fitted, k) for k in range(len(all_bins))])
+    information = (response / scatter).square()
+    block, window, part, position = (
+        torch.cat(columns)
+        for columns in zip(*((b.block, b.window, b.channel // 3, b.rest_position) for b in all_bins), strict=True)
+    )
+    episode = torch.cat([torch.full_like(b.block, k) for k, b in enumerate(all_bins)])
+    selected = block < FORCE_BLOCK
+    has_positions = information[selected].sum() > CRITERIA.report.min_position_information * information.sum()
+    selected = selected if has_positions else ~selected
+    for column in (block, episode * EPISODE_WINDOW_SPACING + window, part):
+        selected = selected & (column == _most_informative(column, information, selected))
+    first = int(selected.nonzero()[0])
     k, w, kind = int(episode[first]), int(window[first]), int(block[first])
-    felt = list(episodes[k].wrenches)
+    if kind >= FORCE_BLOCK:
+        where: dict[str, Any] = {"gripper": list(episodes[k].wrenches)[int(part[first])]}
+    else:
+        where = {"at": position[first, :2].tolist()}
+    start, end = round(w * BIN_SECONDS, 9), round((w + 1) * BIN_SECONDS, 9)
     return {
-        "where": {"gripper": felt[int(part[first])]} if kind >= FORCE_BLOCK else {"at": place[first, :2].tolist()},
-        "when": {"episode": k, "motion": names[k], "from": round(w * BIN_SECONDS, 9), "to": round((w + 1) * BIN_SECONDS, 9)},
-        "moves": {"value": float(moved[chosen].norm()), "unit": BLOCKS[kind].unit},
+        "where": where,
+        "when": {"episode": k, "motion": motions[k], "from": start, "to": end},
+        "response": {"value": float(response[selected].norm()), "unit": BLOCKS[kind].unit},
     }
 
 
-def _alone(found: ModelFit, name: str) -> list[Tensor]:
-    """Per episode [C], in the cells' units: the cause at its amplitude, less what else is fitted could do instead."""
-    model, square = found.model, posterior_precision(found.whitened, found.model)
-    place = len(model.parameters) + model.place(name)
-    others = [k for k in range(found.linearisation.n_coordinates) if k != place]
-    instead = torch.linalg.solve(square[others][:, others], square[others, place])
-    amplitude = model.amplitudes[model.place(name)]
-    return [amplitude * (c.jacobian[:, place] - c.jacobian[:, others] @ instead) for c in found.linearisation.bins]
+def _compute_response(fitted: ModelFit, name: str) -> list[Tensor]:
+    """Return per episode [B] the cause at its amplitude, less what other fitted coordinates could do instead."""
+    model, square = fitted.model, posterior_precision(fitted.whitened, fitted.model)
+    column = len(model.parameters) + model.index_of(name)
+    others = [k for k in range(fitted.linearisation.n_coordinates) if k != column]
+    compensation = torch.linalg.solve(square[others][:, others], square[others, column])
+    amplitude = model.amplitudes[model.index_of(name)]
+    return [
+        amplitude * (bins.jacobian[:, column] - bins.jacobian[:, others] @ compensation)
+        for bins in fitted.linearisation.bins
+    ]
 
 
-def _scatter(found: ModelFit, k: int) -> Tensor:
-    """[C] standard deviation of an episode's cells, ripples among it."""
-    cells = found.linearisation.bins[k]
-    return (found.noise.smooth_variance(cells) / found.noise.smooth_fraction(cells)).sqrt()
+def _bin_std(fitted: ModelFit, k: int) -> Tensor:
+    """Return [B] standard deviations of an episode's bins, including roughness."""
+    bins = fitted.linearisation.bins[k]
+    return (fitted.noise.smooth_variance(bins) / fitted.noise.smooth_fraction(bins)).sqrt()
 
 
-def _most(column: Tensor, told: Tensor, among: Tensor) -> int:
-    """The entry of a column [C] whose cells tell most together."""
-    entries, index = column[among].unique(return_inverse=True)
-    return int(entries[torch.zeros(len(entries)).to(told).index_add(0, index, told[among]).argmax()])
+def _most_informative(column: Tensor, information: Tensor, selected: Tensor) -> int:
+    """Return the entry of a column [B] whose selected bins carry most information together."""
+    entries, index = column[selected].unique(return_inverse=True)
+    totals = torch.zeros(len(entries)).to(information).index_add(0, index, information[selected])
+    return int(entries[totals.argmax()])

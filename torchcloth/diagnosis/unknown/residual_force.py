@@ -1,8 +1,8 @@
-"""A force for what stays unexplained, learned from it: it describes, and is never named as a cause.
+"""Residual force: local force laws that are learned from what stays unexplained. They describe, and name no cause.
 
-Local laws (``effects.ResidualForce``) take the catalogue's place in the same search: each is asked for beside all that
-is fitted anyway, the likeliest are fitted anew, and one is kept only if motions that were held out are predicted
-better with it. That is orthogonal matching pursuit in finite steps, and its path is kept.
+Local laws (``effects.ResidualForce``) take the catalogue's place in the same search. Each is tested beside everything
+that is fitted anyway, the most likely ones are fitted, and one is accepted only if held-out motions are predicted
+better with it. This is orthogonal matching pursuit in finite steps, and its path is recorded.
 """
 
 from __future__ import annotations
@@ -16,109 +16,130 @@ import torch
 
 from ...boundaries import Grasp
 from ...effects import ResidualForce
-from ...effects.residual import LAWS, PLACES, describe
-from ...episodes.world import RESIDUAL, Hypothesis, Model, World
-from ..data.dataset import Progress, DiagnosisData
+from ...effects.residual import RESIDUAL_LAWS, RESIDUAL_PLACES, describe_term
+from ...episodes.world import RESIDUAL_EFFECT_PREFIX, Hypothesis, World, WorldModel
+from ..data.dataset import DiagnosisData, Progress
+from ..decide.criteria import CRITERIA
 from ..decide.search import SearchResult, extend_search, replace_by_law
 from ..inference.comparison import Gain
 from ..inference.fitting import ModelFit, fit
 
-TRIED = 2  # laws that are fitted at each step
-NEARLY_ALL = 0.9  # of what can be explained, beyond which no law does clearly more
-FITTED = ("mass", "bend")  # everywhere alike they are parameters of the base model
-AT = {"inside": 2.0}  # of a law's typical coefficient: this weight's mean square is a fourth of "@edge"'s
+PARAMETER_LAWS = ("mass", "bend")  # applied everywhere they equal parameters of the base model
+TYPICAL_FACTOR_BY_PLACE = {"inside": 2.0}  # the mean square of this weight is a fourth of that of "@edge"
 
 
-def _with(term: str, world: World, coefficient: float) -> World:
-    own: ResidualForce | None = dict(world.cloth.effects.items()).get(RESIDUAL)  # type: ignore[assignment]
-    terms = {} if own is None else dict(zip(own.terms, own.strength.value.tolist(), strict=True))
-    held = [part.index for part in world.cloth.boundaries.values() if isinstance(part, Grasp)]
-    index = torch.cat(held).tolist() if held else []
+def _add_term(term: str, world: World, coefficient: float) -> World:
+    effects = dict(world.cloth.effects.items())
+    effect: ResidualForce | None = effects.get(RESIDUAL_EFFECT_PREFIX)  # type: ignore[assignment]
+    terms = {} if effect is None else dict(zip(effect.terms, effect.strength.value.tolist(), strict=True))
+    grasped = [part.index for part in world.cloth.boundaries.values() if isinstance(part, Grasp)]
+    index = torch.cat(grasped).tolist() if grasped else []
     new = ResidualForce(terms | {term: terms.get(term, 0.0) + coefficient}, index)
-    return world.with_cloth({RESIDUAL: new})
+    return world.with_cloth({RESIDUAL_EFFECT_PREFIX: new})
 
 
-def _term(law: str, place: str) -> Hypothesis:
+def _make_hypothesis(law: str, place: str) -> Hypothesis:
     term = f"{law}@{place}".rstrip("@")
-    change: Callable[[World, float], World] = partial(_with, term)
-    return Hypothesis(f"{RESIDUAL}.{term}", LAWS[law].unit, LAWS[law].typical * AT.get(place, 1.0), change, signed=True)
+    apply: Callable[[World, float], World] = partial(_add_term, term)
+    typical = RESIDUAL_LAWS[law].typical * TYPICAL_FACTOR_BY_PLACE.get(place, 1.0)
+    return Hypothesis(f"{RESIDUAL_EFFECT_PREFIX}.{term}", RESIDUAL_LAWS[law].unit, typical, apply, signed=True)
 
 
-TERMS = tuple(_term(law, place) for law in LAWS for place in PLACES if place or law not in FITTED)
+RESIDUAL_HYPOTHESES = tuple(
+    _make_hypothesis(law, place)
+    for law in RESIDUAL_LAWS
+    for place in RESIDUAL_PLACES
+    if place or law not in PARAMETER_LAWS
+)
 
 
 @dataclass(frozen=True, eq=False)
 class ResidualForceFit:
-    """What was learned.
+    """Local force laws that were learned.
 
     Attributes:
-        found: the search among laws, from the model with its causes.
+        search: the search among laws, from the model with its causes.
     """
 
     search: SearchResult
 
     @property
-    def model(self) -> Model:
-        """With the residual force; its parameters and causes were fitted beside it."""
+    def model(self) -> WorldModel:
+        """The model with the residual force; its parameters and causes were fitted with it."""
         return self.search.end.model
 
     @property
     def terms(self) -> dict[str, float]:
-        """Coefficient [SI] by term."""
+        """Coefficient of each term, in SI units."""
         pairs = zip(self.model.accepted, self.model.amplitudes, strict=True)
-        return {h.name.removeprefix(f"{RESIDUAL}."): a for h, a in pairs if is_residual(h)}
+        return {h.name.removeprefix(f"{RESIDUAL_EFFECT_PREFIX}."): a for h, a in pairs if is_residual(h)}
 
     @property
     def gain(self) -> Gain | None:
-        """On motions held out, over the model without it; None: nothing was learned."""
+        """Gain over the model without the laws, on held-out motions; None: nothing was learned."""
         return self.search.total_gain
 
     def as_dict(self) -> dict[str, Any]:
-        """The content of diagnosis.json."""
-        gain = self.gain
+        """Return the content of diagnosis.json."""
+        gain, prefix = self.gain, f"{RESIDUAL_EFFECT_PREFIX}."
         return {
             "terms": [
-                {"law": term, "coefficient": c, "unit": LAWS[term.partition("@")[0]].unit, "told": describe(term, c)}
-                for term, c in self.terms.items()
+                {
+                    "law": term,
+                    "coefficient": coefficient,
+                    "unit": RESIDUAL_LAWS[term.partition("@")[0]].unit,
+                    "description": describe_term(term, coefficient),
+                }
+                for term, coefficient in self.terms.items()
             ],
             "path": [
                 {
-                    "kept": s.candidate.hypothesis.name.removeprefix(f"{RESIDUAL}."),
-                    "log_density": s.candidate.gain.log_density,
-                    "instead_of": [c.hypothesis.name.removeprefix(f"{RESIDUAL}.") for c in s.tried if c is not s.candidate],
+                    "accepted": cause.candidate.hypothesis.name.removeprefix(prefix),
+                    "log_density": cause.candidate.gain.log_density,
+                    "rejected": [
+                        c.hypothesis.name.removeprefix(prefix) for c in cause.tried if c is not cause.candidate
+                    ],
                 }
-                for s in self.search.accepted
+                for cause in self.search.accepted
             ],
             "gain": None if gain is None else {"rms_before": gain.rms_before, "rms_after": gain.rms_after, "unit": "m"},
         }
 
 
 def is_residual(hypothesis: Hypothesis) -> bool:
-    """Whether it is a law of a residual force, and no cause."""
-    return hypothesis.name.startswith(f"{RESIDUAL}.")
+    """Check whether a hypothesis is a law of a residual force, and no cause."""
+    return hypothesis.name.startswith(f"{RESIDUAL_EFFECT_PREFIX}.")
 
 
-def check_against_laws(found: SearchResult, progress: Progress = lambda _: None) -> SearchResult:
-    """A search with its causes, or without where one law does clearly more: something that nobody asked about.
+def check_against_laws(result: SearchResult, progress: Progress = lambda _: None) -> SearchResult:
+    """Drop the causes of a search if one law does clearly more: then something is wrong that nobody asked about.
 
-    What is not in the catalogue may be done in part by what is: a stiff patch by a wider grip.
-    """
-    if not found.causes or found.total_gain is None or found.total_gain.explained_fraction > NEARLY_ALL:
-        return found
-    start, setting = found.start, found.data
-    asked, known = start.model.others(TERMS), start.linearisation
-    laws = fit(start.model, setting, asked, 0, progress, start.noise, known, known)
-    return replace_by_law(found, laws, TRIED, progress)
-
-
-def learn_residual_force(found: ModelFit, setting: DiagnosisData, progress: Progress = lambda _: None) -> ResidualForceFit:
-    """Local laws that mend what a model with its causes leaves, if any does.
+    What is not in the catalogue may be explained in part by what is, for example a stiff patch by a wider grip.
 
     Args:
-        found: a model at its solution.
-        setting: the episodes that it was fitted to.
-        progress: called with one line for each thing that is simulated.
+        result: the search.
+        progress: called with one line for each episode that is simulated.
     """
-    laws = found.model.others(TERMS)
-    start = fit(found.model, setting, laws, 1, progress, before=found.linearisation, here=found.linearisation)
-    return ResidualForceFit(extend_search(start, setting, laws, progress, TRIED))
+    criteria, gain = CRITERIA.residual_law, result.total_gain
+    if not result.causes or gain is None or gain.explained_fraction > criteria.max_explained_by_causes:
+        return result
+    start, here = result.start, result.start.linearisation
+    laws = start.model.not_accepted(RESIDUAL_HYPOTHESES)
+    fitted = fit(start.model, result.data, laws, 0, progress, start.noise, here, here)
+    return replace_by_law(result, fitted, criteria.max_tried, progress)
+
+
+def learn_residual_force(
+    fitted: ModelFit, data: DiagnosisData, progress: Progress = lambda _: None
+) -> ResidualForceFit:
+    """Learn local laws that explain what a model with its causes leaves, if any does.
+
+    Args:
+        fitted: a model at its solution.
+        data: the episodes that it was fitted to.
+        progress: called with one line for each episode that is simulated.
+    """
+    laws = fitted.model.not_accepted(RESIDUAL_HYPOTHESES)
+    here = fitted.linearisation
+    start = fit(fitted.model, data, laws, 1, progress, before=here, here=here)
+    return ResidualForceFit(extend_search(start, data, laws, progress, CRITERIA.residual_law.max_tried))
