@@ -16,6 +16,7 @@ from torchcloth.training.studies import hidden, hidden_archive, hidden_tables
 from torchcloth.training.studies.command import main
 from torchcloth.training.validation.hidden import case_sampling, reveal_truth
 
+VALIDATION = "torchcloth.training.validation.hidden."
 ANSWER = {"verdict": "adequate", "causes": [], "unresolvable": [], "undecided": [], "model": None}
 
 
@@ -25,7 +26,8 @@ def called(monkeypatch):
     commands = []
 
     def run(command):
-        commands.append([Path(part).name if "/" in part else part for part in command[1:]])
+        arguments = command[2:] if command[2].startswith(VALIDATION) else command[1:]
+        commands.append([Path(a).name if "/" in a else a.removeprefix(VALIDATION) for a in arguments])
         out = Path(command[command.index("--out") + 1]) if "--out" in command else None
         if "diagnose" in command:
             (out / "diagnosis.json").parent.mkdir(parents=True)
@@ -34,12 +36,12 @@ def called(monkeypatch):
             for name in ("e1", "e2", ".e2.0123.partial"):
                 (out / name).mkdir(parents=True)
             return Namespace(returncode=0, stdout=f"{out / 'e1'}: hang\n{out / 'e2'}: turn\n", stderr="")
-        elif "shows.py" in commands[-1]:
-            sizes = [{"name": "x.jet", "left_moves": 1e-3, "left_pulls": 0.0}]
+        elif "visibility" in commands[-1]:
+            sizes = [{"name": "x.jet", "unexplained_displacement_rms_m": 1e-3, "unexplained_force_rms_n": 0.0}]
             return Namespace(returncode=0, stdout=json.dumps(sizes), stderr="")
-        else:  # what reveal.py prints
+        else:  # what reveal_truth prints
             seed = int(command[command.index("--seed") + 1])
-            truth = reveal_truth.truth(case_sampling.case(seed))
+            truth = reveal_truth.reveal_truth(case_sampling.draw_case(seed))
             return Namespace(returncode=0, stdout=json.dumps(truth), stderr="")
         return Namespace(returncode=0, stdout="", stderr="")
 
@@ -57,7 +59,7 @@ def options(tmp_path, **more):
 def test_the_truth_is_opened_after_the_answer_and_nothing_is_told(called, tmp_path):
     hidden.run(options(tmp_path, dev=True, cases=2))
     kinds = [command[0] if command[0] != "-m" else command[2] for command in called]
-    assert kinds == ["make.py", "diagnose", "reveal.py"] * 2
+    assert kinds == ["make_case", "diagnose", "reveal_truth"] * 2
     assert called[1] == ["-m", "torchcloth.cli", "diagnose", "e1", "e2", "--out", "001"]
     resumable = json.loads((tmp_path / "s" / "cases" / "001.json").read_text())
     assert resumable["truth"]["family"] == "null"
@@ -65,9 +67,9 @@ def test_the_truth_is_opened_after_the_answer_and_nothing_is_told(called, tmp_pa
 
 
 def test_what_the_catalogue_does_not_know_is_asked_whether_it_shows(called, tmp_path):
-    seed = next(s for s in range(20) if case_sampling.case(s).family == "outside")
+    seed = next(s for s in range(20) if case_sampling.draw_case(s).family == "outside")
     assert hidden.one(tmp_path, "001", seed, False)["sizes"][0]["name"] == "x.jet"
-    assert [c[0] for c in called].index("shows.py") > [c[0] for c in called].index("reveal.py")
+    assert [c[0] for c in called].index("visibility") > [c[0] for c in called].index("reveal_truth")
 
 
 def test_finished_cases_are_not_repeated_and_more_may_be_added(called, tmp_path, capsys):
@@ -75,7 +77,7 @@ def test_finished_cases_are_not_repeated_and_more_may_be_added(called, tmp_path,
     first = (tmp_path / "s" / "cases" / "002.json").read_text()
     del called[:]
     hidden.run(options(tmp_path, cases=4))  # the folder remembers its secret
-    assert len([c for c in called if "make.py" in c]) == 1
+    assert len([c for c in called if "make_case" in c]) == 1
     assert (tmp_path / "s" / "cases" / "002.json").read_text() == first
     assert "What must show" in capsys.readouterr().out
     assert (tmp_path / "s" / "hidden.md").read_text().count("| 00") == 4
@@ -115,13 +117,13 @@ def test_archived_rounds_are_scored_as_the_page_has_them(tmp_path):
 
 
 def test_keys_of_old_files_get_their_present_names(monkeypatch):
-    table = {"truth.effects.beside": "extra", "answer.causes": "reasons", "answer.causes.rivals": "others"}
+    table = {"truth.effects.old": "new", "answer.one": "two", "answer.one.left": "right"}
     monkeypatch.setattr(hidden_archive, "RENAMED_KEYS", {7: table})
     monkeypatch.setattr(hidden_archive, "CURRENT_SCHEMA", 8)
-    answer = {"causes": [{"rivals": [{"rivals": 1}]}], "gain": {"causes": 2}}
-    new = {"reasons": [{"others": [{"rivals": 1}]}], "gain": {"causes": 2}}
-    case = {"truth": {"effects": [{"beside": True}]}, "answer": answer, "next": {"proposed": answer, "random": None}}
-    expected = {"truth": {"effects": [{"extra": True}]}, "answer": new, "next": {"proposed": new, "random": None}}
+    before = {"one": [{"left": [{"left": 1}]}], "gain": {"one": 2}}
+    after = {"two": [{"right": [{"left": 1}]}], "gain": {"one": 2}}
+    case = {"truth": {"effects": [{"old": True}]}, "answer": before, "next": {"proposed": before, "random": None}}
+    expected = {"truth": {"effects": [{"new": True}]}, "answer": after, "next": {"proposed": after, "random": None}}
     assert hidden_archive.upgrade(case, 7) == expected
     assert hidden_archive.upgrade(expected, 8) == expected
     with pytest.raises(ValueError, match="schema 6"):
@@ -233,7 +235,7 @@ def test_what_the_system_kills_is_no_answer(monkeypatch, tmp_path):
 
 def test_one_round_is_of_one_code(called, tmp_path, monkeypatch):
     hidden.run(options(tmp_path, seed=9, cases=1))
-    monkeypatch.setattr(resumable, "program", lambda *beside: "another")
+    monkeypatch.setattr(resumable, "source_fingerprint", lambda *folders: "another")
     with pytest.raises(InvalidInput, match="holds a study with code"):
         hidden.run(options(tmp_path, cases=2))
 
@@ -259,9 +261,9 @@ def test_a_diagnosis_that_was_stopped_is_no_answer_and_goes_on(monkeypatch, tmp_
 def test_experiments_are_made_of_the_same_case_and_answered_with_all_episodes(called, tmp_path, monkeypatch):
     monkeypatch.setattr(hidden, "read", lambda path: path)
     monkeypatch.setattr(
-        hidden, "possible", lambda episodes: [(Experiment("hang"), None), (Experiment("turn"), episodes)]
+        hidden, "list_experiments", lambda episodes: [(Experiment("hang"), None), (Experiment("turn"), episodes)]
     )
-    monkeypatch.setattr(hidden, "heading_of", lambda template: np.deg2rad(5.0 * len(template)))
+    monkeypatch.setattr(hidden, "measure_heading", lambda template: np.deg2rad(5.0 * len(template)))
     made = []
 
     def make(*arguments):
@@ -278,9 +280,9 @@ def test_experiments_are_made_of_the_same_case_and_answered_with_all_episodes(ca
 
 
 def test_a_case_that_needs_no_experiment_tells_nothing_of_experiments():
-    seed = next(s for s in range(20) if case_sampling.case(s).family == "next experiment")
-    truth = reveal_truth.truth(case_sampling.case(seed))
-    (name,) = (e["hypothesis"] for e in truth["effects"] if not e["beside"])
+    seed = next(s for s in range(20) if case_sampling.draw_case(s).family == "next experiment")
+    truth = reveal_truth.reveal_truth(case_sampling.draw_case(seed))
+    (name,) = (e["hypothesis"] for e in truth["effects"] if not e["is_enabling"])
     cause = {"effect": name, "amplitude": 1.0, "class": [name], "rivals": [], "ci95": [0.0, 2.0]}
     sure, unsure = ANSWER | {"causes": [cause]}, ANSWER | {"causes": [cause | {"rivals": [{"effect": "my.own"}]}]}
     none = {"proposed": None, "random": None}

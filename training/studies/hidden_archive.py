@@ -30,9 +30,22 @@ CURRENT_SCHEMA = 2  # of the keys that cases are written with today
 # the case's root, joined by dots; lists in between are not counted, so "answer.causes.rivals" is a key of each cause.
 # What is said of "answer" holds for the two answers under "next" as well.
 RENAMED_KEYS: dict[int, dict[str, str]] = {
-    1: {},
+    1: {
+        "truth.effects.beside": "is_enabling",
+        "truth.effects.share": "typical_fraction",
+        "truth.said": "data_sheet_ratio",
+        "truth.confounded.like": "causes",
+        "truth.confounded.soft": "may_be_separable",
+        "sizes.moves": "displacement_rms_m",
+        "sizes.pulls": "force_rms_n",
+        "sizes.left_moves": "unexplained_displacement_rms_m",
+        "sizes.left_pulls": "unexplained_force_rms_n",
+    },
 }
-ANSWER_PATHS = {("next", "proposed"): ("answer",), ("next", "random"): ("answer",)}
+ANSWER_PATHS: dict[tuple[str, ...], tuple[str, ...]] = {
+    ("next", "proposed"): ("answer",),
+    ("next", "random"): ("answer",),
+}
 
 # Statistics of each motion's residuals are two fifths of an answer, and no score uses them.
 ROUNDED_KEY = "lack_of_fit"
@@ -86,9 +99,10 @@ def write_archive(folder: Path, path: Path, name: str, date: str) -> None:
     if len(schemas) != 1:
         raise InvalidInput("folder", got=f"{folder} with schemas {sorted(schemas)}", expected="cases of one schema")
     settings = json.loads((folder / "study.json").read_text())
-    lines = [{"schema": schemas.pop(), "round": name, "date": date, **settings}]
+    lines = [settings | {"schema": schemas.pop(), "round": name, "date": date}]
     lines += [{"name": key, **{k: _round_statistics(k, v) for k, v in case.items()}} for key, case in cases.items()]
-    with write_atomically(path) as part, lzma.open(part, "wt", preset=9 | lzma.PRESET_EXTREME, encoding="utf-8") as file:
+    preset = 9 | lzma.PRESET_EXTREME
+    with write_atomically(path) as part, lzma.open(part, "wt", preset=preset, encoding="utf-8") as file:
         file.writelines(json.dumps(line, ensure_ascii=False, separators=(",", ":")) + "\n" for line in lines)
 
 
