@@ -13,19 +13,19 @@ from helpers import linear_evidence as toys
 from helpers import sheet_episodes
 from helpers.undecided_search import undecided
 
-from torchcloth.diagnosis import base_model, prepare_data
+from torchcloth.diagnosis import build_base_model, prepare_data
 from torchcloth.diagnosis.data.dataset import extend_for_clock
 from torchcloth.diagnosis.decide.candidates import HARDLY
 from torchcloth.diagnosis.experiment import proposal
-from torchcloth.diagnosis.experiment.motions import LIBRARY, PLANS, Experiment, heading_of, planned, possible
+from torchcloth.diagnosis.experiment.motions import EXPERIMENTS, MOTIONS, Experiment, measure_heading, make_episode, list_experiments
 from torchcloth.diagnosis.experiment.proposal import (
-    Question,
-    as_seen,
-    distances,
-    information,
-    propose,
-    question_of,
-    whitened_slopes,
+    OpenQuestion,
+    simulate_measurements,
+    compute_chi2,
+    compute_information,
+    propose_experiment,
+    find_open_question,
+    simulate_whitened_slopes,
 )
 from torchcloth.diagnosis.inference.linearise import central_differences
 from torchcloth.episodes.observed import build_episode
@@ -34,11 +34,11 @@ from torchcloth.recordings import Collider
 MOTIONS = """
 import json, sys
 from torchcloth.training.validation.independent.flex_sheet import SheetSpec
-from torchcloth.training.validation.independent.motions import motion
+from torchcloth.training.validation.independent.motions import make_motion
 sheet = SheetSpec(0.2, 0.2, areal_density=0.2, membrane_stiffness=60.0, damping_time=1e-4)
 found = []
 for name, heading, speed in json.loads(sys.argv[1]):
-    m = motion(name, sheet, heading, speed)
+    m = make_motion(name, sheet, heading, speed)
     found.append({n: p[:, :3, 3].tolist() for n, p in m.pose.items()})
 print(json.dumps(found))
 """
@@ -47,12 +47,12 @@ print(json.dumps(found))
 def test_the_library_is_that_of_the_independent_engine():
     """Displacements and turns of both grippers, by the other code."""
     template = sheet_episodes.episode()
-    own = float(np.rad2deg(heading_of(template)))
-    asked = json.dumps([[e.motion, e.heading + own, e.speed] for e in LIBRARY])
+    own = float(np.rad2deg(measure_heading(template)))
+    asked = json.dumps([[e.motion, e.heading + own, e.speed] for e in EXPERIMENTS])
     run = [sys.executable, "-c", MOTIONS, asked]
     out = subprocess.run(run, capture_output=True, text=True, check=True).stdout
-    for experiment, paths in zip(LIBRARY, json.loads(out), strict=True):
-        plan = planned(experiment, template)
+    for experiment, paths in zip(EXPERIMENTS, json.loads(out), strict=True):
+        plan = make_episode(experiment, template)
         own = np.stack([plan.grippers[n].position for n in ("left", "right")])
         other = np.stack([np.asarray(paths[n]) for n in ("left", "right")])
         assert own.shape == other.shape, experiment
@@ -68,7 +68,7 @@ def test_an_experiment_begins_as_the_episode_that_it_repeats_and_is_turned_from_
     begun = {n: np.asarray(g.position[0]) for n, g in template.grippers.items()}
     centre = np.mean(list(begun.values()), axis=0)
     for heading in (0.0, 90.0):
-        plan = planned(Experiment("swing", heading), template)
+        plan = make_episode(Experiment("swing", heading), template)
         c, s = np.cos(np.deg2rad(heading)), np.sin(np.deg2rad(heading))
         turn = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
         for name, place in begun.items():
@@ -78,35 +78,35 @@ def test_an_experiment_begins_as_the_episode_that_it_repeats_and_is_turned_from_
         assert way @ edge == pytest.approx(0.0, abs=1e-9)  # square to the edge
         assert way.max() > 0.04
     named = replace(template, grippers={"b": template.grippers["left"], "a": template.grippers["right"]}, grasps={})
-    assert abs(abs(heading_of(named) - heading_of(template)) - np.pi) < 1e-9  # hanging: either side
+    assert abs(abs(measure_heading(named) - measure_heading(template)) - np.pi) < 1e-9  # hanging: either side
 
 
 def test_cloth_that_lies_is_dragged_away_from_where_it_lies():
     hanging = sheet_episodes.episode()
     flat = np.asarray(hanging.cloth.initial_vertices)
-    own = heading_of(hanging)
+    own = measure_heading(hanging)
     for side in (-1.0, 1.0):
         down = side * (flat[..., 2:].max() - flat[..., 2:]) * np.array([np.cos(own), np.sin(own), 0.0])
         lying = np.concatenate([flat[..., :2], 0 * flat[..., 2:]], -1) + down
         table = {"table": Collider(np.zeros(3), np.array([0.0, 0.0, 1.0]))}
         recording = replace(hanging, cloth=replace(hanging.cloth, initial_vertices=lying), colliders=table)
-        way = planned(Experiment("drag"), recording).grippers["left"].position
+        way = make_episode(Experiment("drag"), recording).grippers["left"].position
         assert (way[-1] - way[0]) @ down.reshape(-1, 3).mean(0) < 0
 
 
 def test_only_what_can_be_begun_is_asked_for():
-    hanging = [str(e) for e, _ in possible([sheet_episodes.episode()])]
-    assert len(hanging) == sum(not PLANS[e.motion].lying for e in LIBRARY)
+    hanging = [str(e) for e, _ in list_experiments([sheet_episodes.episode()])]
+    assert len(hanging) == sum(not MOTIONS[e.motion].lying for e in EXPERIMENTS)
     assert "swing, grippers and cloth turned by 90 degrees" in hanging
-    assert possible([]) == []
+    assert list_experiments([]) == []
 
 
 def test_distances_are_those_of_two_columns():
     """What chi^2 is left of i's effect when j does its best, by least squares, beyond what engines may differ by."""
     slopes = toys.smooth(5, 6)  # 2 own, 3 hypotheses, a nuisance
     found = toys.fitted(toys.evidence(slopes, 2, ["a", "b", "c"], torch.zeros(5).double(), 0))
-    question = Question(found, {"c": 0.7, "a": 0.4}, (("c", "a"),))
-    told = distances(question, information(question, []))[("c", "a")]
+    question = OpenQuestion(found, {"c": 0.7, "a": 0.4}, (("c", "a"),))
+    told = compute_chi2(question, compute_information(question, []))[("c", "a")]
     white, prior = found.whitened.jacobian, 2.0 * torch.eye(2).double()
     fitted = torch.cat([white[:, :2], prior])
 
@@ -119,7 +119,7 @@ def test_distances_are_those_of_two_columns():
     one, other = beyond(0, 0.7 * wide(2)), beyond(2, 0.4 * wide(0))
     assert told == pytest.approx(min(one, other), rel=1e-6)
     again = white[: len(white) // 2][:, [0, 1, 4, 2]]
-    more = distances(question, information(question, [again]))[("c", "a")]
+    more = compute_chi2(question, compute_information(question, [again]))[("c", "a")]
     assert more > told
 
 
@@ -136,15 +136,15 @@ def test_gravity_and_camera_are_told_apart_by_turning(said, monkeypatch):
     Its edge is along y here, where it hangs with a lean along y edgewise.
     """
     found, content, setting = undecided(("env.gravity_tilt[y]", "obs.rotation[x]"), said)
-    question = question_of(found, content)
-    now = distances(question, information(question, []))
+    question = find_open_question(found, content)
+    now = compute_chi2(question, compute_information(question, []))
     told = {}
     for name in ("hang", "turn"):
-        slopes = whitened_slopes(question, planned(Experiment(name, -90.0), setting.recordings[0]), setting)
-        told[name] = min(distances(question, information(question, [slopes])).values())
+        slopes = simulate_whitened_slopes(question, make_episode(Experiment(name, -90.0), setting.recordings[0]), setting)
+        told[name] = min(compute_chi2(question, compute_information(question, [slopes])).values())
     monkeypatch.setattr(proposal, "central", smooth)
-    calm = whitened_slopes(question, planned(Experiment("turn", -90.0), setting.recordings[0]), setting)
-    assert min(distances(question, information(question, [calm])).values()) > told["turn"]  # ripples tell less
+    calm = simulate_whitened_slopes(question, make_episode(Experiment("turn", -90.0), setting.recordings[0]), setting)
+    assert min(compute_chi2(question, compute_information(question, [calm])).values()) > told["turn"]  # ripples tell less
     least = min(now.values())
     assert told["turn"] - least > 10 * (told["hang"] - least) >= 0
 
@@ -152,7 +152,7 @@ def test_gravity_and_camera_are_told_apart_by_turning(said, monkeypatch):
 def test_nothing_open_asks_for_nothing():
     end = toys.fitted(toys.evidence(toys.smooth(5, 4), 1, ["a", "b"], torch.zeros(3).double(), 0))
     found, none = SimpleNamespace(causes=[], minor=[], screened=[], end=end), {"causes": [], "minor": []}
-    assert propose(found, none, SimpleNamespace(recordings=()), print) is None
+    assert propose_experiment(found, none, SimpleNamespace(recordings=()), print) is None
 
 
 def test_what_does_the_same_as_a_fitted_number_is_not_waited_for():
@@ -162,9 +162,9 @@ def test_what_does_the_same_as_a_fitted_number_is_not_waited_for():
     end = replace(end, evidence=replace(end.linearisation, hypotheses=[twin, other]))
     rows = [SimpleNamespace(hypothesis=h, decision="inconclusive") for h in (twin, other)]
     found, none = SimpleNamespace(causes=[], minor=[], screened=rows, end=end), {"causes": [], "minor": []}
-    assert question_of(found, none).amplitudes.keys() == {"b"}
+    assert find_open_question(found, none).amplitudes.keys() == {"b"}
     found.screened = rows[:1]
-    assert question_of(found, none) is None
+    assert find_open_question(found, none) is None
 
 
 def test_an_experiment_feels_what_the_data_felt():
@@ -172,9 +172,9 @@ def test_an_experiment_feels_what_the_data_felt():
     seen = sheet_episodes.recorded("slow", lambda world: world, 0)
     pulled = {name: replace(g, force=np.tile([0, 0, -0.04], (len(g.t), 1))) for name, g in seen.grippers.items()}
     seen = replace(seen, grippers=pulled)
-    model = base_model(seen)
+    model = build_base_model(seen)
     setting = prepare_data(model, [seen])
-    blank = extend_for_clock(build_episode(model.base.cloth, replace(planned(Experiment("hang"), seen), joints={})))
-    felt = as_seen(model.world().frames(blank), blank, setting).wrenches["left"]
+    blank = extend_for_clock(build_episode(model.base.cloth, replace(make_episode(Experiment("hang"), seen), joints={})))
+    felt = simulate_measurements(model.build_world().simulate_observed(blank), blank, setting).wrenches["left"]
     assert felt[1:, :3].isfinite().all()
     assert felt[:, 3:].isnan().all()

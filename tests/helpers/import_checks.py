@@ -10,6 +10,7 @@ ALLOWED = (
     "torchcloth.observe",
     "torchcloth.errors",
     "torchcloth.types",
+    "torchcloth._utils.constants",
     f"{VALIDATION}.independent",
 )
 

@@ -5,18 +5,18 @@ import torch
 from helpers import sheet_episodes
 
 from torchcloth import recordings as rec
-from torchcloth.diagnosis import base_model, fit, save_model, setting_of
-from torchcloth.diagnosis.causes.hypotheses import known
-from torchcloth.recordings.consistency import together
+from torchcloth.diagnosis import build_base_model, fit, save_model, prepare_data
+from torchcloth.diagnosis.causes.hypotheses import list_known_hypotheses
+from torchcloth.recordings.consistency import merge_scene
 from torchcloth.training.studies import hidden_gain
 from torchcloth.training.studies.hidden_gain import gain, knowing
 
-DRAG = next(h for h in known() if h.name == "air.drag_n")
+DRAG = next(h for h in list_known_hypotheses() if h.name == "air.drag_n")
 TRUE = 1.5
 
 
 def truth(hypothesis="air.drag_n", sign=1.0):
-    return {"effects": [{"name": "?", "amplitude": TRUE, "hypothesis": hypothesis, "sign": sign, "beside": False}]}
+    return {"effects": [{"name": "?", "amplitude": TRUE, "hypothesis": hypothesis, "sign": sign, "is_enabling": False}]}
 
 
 @pytest.fixture(scope="module")
@@ -29,8 +29,8 @@ def case(tmp_path_factory):
         recording = sheet_episodes.recorded(motion, lambda world: DRAG.apply(world, TRUE), k)
         paths[motion] = rec.write(recording, folder / motion)
     recordings = [rec.read(paths[name]) for name in ("slow", "lift")]
-    model = base_model(recordings[0])
-    fitted = fit(model, setting_of(model, recordings))
+    model = build_base_model(recordings[0])
+    fitted = fit(model, prepare_data(model, recordings))
     yield folder, paths, recordings[0], fitted
     torch.set_default_dtype(before)
 
@@ -40,8 +40,8 @@ def oracle(case):
     """Fitted once: it knows the same in all of these."""
     _, paths, _recording, _ = case
     recordings = [rec.read(paths[name]) for name in ("slow", "lift")]
-    base = base_model(together([*recordings, rec.read(paths["fast"])]))
-    return hidden_gain._fitted(knowing(base, truth()), setting_of(base, recordings))
+    base = build_base_model(merge_scene([*recordings, rec.read(paths["fast"])]))
+    return hidden_gain._fitted(knowing(base, truth()), prepare_data(base, recordings))
 
 
 @pytest.mark.parametrize(("amplitude", "low", "high"), [(None, -1e-9, 1e-9), (TRUE, 0.7, 1.0), (0.5 * TRUE, 0.3, 0.7)])
@@ -66,5 +66,5 @@ def test_what_nobody_can_know_is_not_compared(case):
     assert knowing(base, {"effects": []}) is None
     oracle = knowing(base, truth(sign=-1.0))
     assert [(h.name, a) for h, a in oracle.hidden] == [("air.drag_n", -TRUE)]
-    beside = truth("air.wind[x]")["effects"] + [truth()["effects"][0] | {"beside": True}]
+    beside = truth("air.wind[x]")["effects"] + [truth()["effects"][0] | {"is_enabling": True}]
     assert [h.name for h, _ in knowing(base, {"effects": beside}).hidden] == ["air.wind[x]"]

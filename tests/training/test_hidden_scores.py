@@ -15,7 +15,7 @@ def hidden(family, *effects, kind="1", **more):
             "amplitude": a,
             "names": list(rest[0]) if rest else [n],
             "sign": 1.0,
-            "beside": False,
+            "is_enabling": False,
             "hypothesis": n,
         }
         for n, a, *rest in effects
@@ -101,7 +101,7 @@ def test_alone_and_false_is_confident_and_wrong_even_beside_what_is_right():
 
 def test_what_a_wind_needs_is_no_false_cause():
     wind = hidden("single", ("air.wind", 0.3))
-    wind["effects"].insert(0, hidden("", ("air.drag_n", 1.2))["effects"][0] | {"beside": True})
+    wind["effects"].insert(0, hidden("", ("air.drag_n", 1.2))["effects"][0] | {"is_enabling": True})
     found = judged(wind, answer(cause("air.wind[x]", 0.3), cause("air.drag_n", 1.2)))
     assert (found["right"], found["wrong"], found["spurious"]) == (True, False, 0)
     only = judged(wind, answer(cause("air.drag_n", 1.2)))
@@ -124,7 +124,7 @@ def test_both_of_two():
     assert (one["right"], one["found"]) == (False, [False, True])
 
 
-LIKE = {"confounded": {"like": ["env.gravity_tilt", "air.wind"], "soft": False}}
+LIKE = {"confounded": {"causes": ["env.gravity_tilt", "air.wind"], "may_be_separable": False}}
 
 
 @pytest.mark.parametrize(
@@ -145,7 +145,7 @@ def test_confounded_cases_ask_for_doubt(said, right):
 
 
 def test_where_the_data_might_tell_its_name_alone_is_right():
-    soft = hidden("confounded", ("air.linear", 1.0), confounded={"like": ["air.linear", "air.drag_n"], "soft": True})
+    soft = hidden("confounded", ("air.linear", 1.0), confounded={"causes": ["air.linear", "air.drag_n"], "may_be_separable": True})
     assert judged(soft, answer(cause("air.linear")))["right"]
     assert not judged(soft, answer(cause("air.drag_n")))["right"]
 
@@ -232,8 +232,8 @@ def test_the_page_has_every_case_and_every_mark():
 def test_what_shows_is_asked_of_the_truths_engine():
     both = hidden("double", ("mass.hem", 0.02), ("damp.kv", 0.004), ("obs.clock", 0.02))
     sizes = [
-        {"name": "mass.hem", "left_moves": 1e-3, "left_pulls": 0.0},
-        {"name": "damp.kv", "left_moves": 1e-4, "left_pulls": 2e-3},
+        {"name": "mass.hem", "unexplained_displacement_rms_m": 1e-3, "unexplained_force_rms_n": 0.0},
+        {"name": "damp.kv", "unexplained_displacement_rms_m": 1e-4, "unexplained_force_rms_n": 2e-3},
     ]
     assert shows(both, sizes) == [True, False, True], "a clock moves no cloth and is seen"
     assert shows(both, None) is None

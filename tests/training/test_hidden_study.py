@@ -106,8 +106,8 @@ def test_rounds_are_scored_side_by_side_and_together(called, tmp_path, capsys):
 
 def test_archived_rounds_are_scored_as_the_page_has_them(tmp_path):
     """If a label or a key is renamed: a row of ``RENAMED_KEYS`` for keys, and rounds.csv written again for labels."""
-    folder = Path(__file__).parents[2] / "docs" / "hidden"
-    archives = sorted((folder / "rounds").glob("*.jsonl.xz"))
+    folder = Path(__file__).parents[2] / "docs" / "validation" / "blind-rounds"
+    archives = sorted((folder / "answers").glob("*.jsonl.xz"))
     assert all(path.stat().st_size < 200_000 for path in archives)
     rounds = hidden.score_rounds(options(tmp_path, answers=archives))
     fresh = list(csv.reader(hidden_tables.rounds_csv(rounds).splitlines()))

@@ -7,14 +7,14 @@ import pytest
 
 from torchcloth.training.studies import reach
 from torchcloth.training.studies.command import main
-from torchcloth.training.validation.independent.motions import motion
+from torchcloth.training.validation.independent.motions import make_motion
 
 TINY = reach.Scale(motions=("hang",), nodes=9, fit_nodes=7, iterations=3)
 
 
 def test_the_hidden_path_begins_as_the_known_one_and_ends_elsewhere():
     scene = reach.scene(TINY)
-    moved = motion("swing", scene.true.sheet)
+    moved = make_motion("swing", scene.true.sheet)
     hidden = reach._elsewhere(moved, np.random.default_rng(0))
     for name, pose in moved.pose.items():
         assert np.allclose(hidden.pose[name][0], pose[0])

@@ -40,7 +40,7 @@ def test_against_zero_only_what_matters_changes():
     rows = {r.hypothesis.name: r for r in screen(screening_ablations.against_zero(toys.fitted(evidence())))}
     for r in screen(toys.fitted(evidence())):
         assert rows[r.hypothesis.name].amplitude == r.amplitude
-        assert rows[r.hypothesis.name].hypothesis.smallest == 0.0 < r.hypothesis.smallest
+        assert rows[r.hypothesis.name].hypothesis.smallest_of_interest == 0.0 < r.hypothesis.smallest_of_interest
 
 
 def test_on_one_mesh_residuals_are_those_of_the_given_one():
@@ -67,7 +67,7 @@ def row(effect, amplitude, decision="present"):
 
 def hidden(name, amplitude, beside=False):
     own = name.partition("[")[0]
-    return {"names": [own], "hypothesis": name, "amplitude": amplitude, "sign": 1.0, "beside": beside}
+    return {"names": [own], "hypothesis": name, "amplitude": amplitude, "sign": 1.0, "is_enabling": beside}
 
 
 def test_what_is_present_and_not_there_is_counted_beside_the_size_of_what_is():

@@ -23,11 +23,11 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from torchcloth._utils.files import PROGRESS_FOLDER_NAME, write_text
-from torchcloth.diagnosis.experiment.motions import heading_of, possible
+from torchcloth.diagnosis.experiment.motions import list_experiments, measure_heading
 from torchcloth.errors import InvalidInput
 from torchcloth.recordings import read
 
-from ..resumable import Kept
+from ..resumable import ResumableStudy
 from ..validation.hidden import case_sampling
 from ..validation.independent import motions
 from . import hidden_archive, hidden_tables
@@ -68,7 +68,7 @@ def add(parser: argparse.ArgumentParser) -> None:
         type=Path,
         nargs="+",
         metavar="ROUND",
-        help="only score finished rounds again, each and all together: archives (docs/hidden/rounds) or study folders",
+        help="only score finished rounds again, each and all together: archives (docs/validation/blind-rounds/answers) or study folders",
     )
 
 
@@ -84,12 +84,12 @@ def run(options: argparse.Namespace) -> None:
         print(f"all rounds: {options.out / 'rounds.md'}, {options.out / 'rounds.csv'}")
         return
     chosen = drawn(options)
-    kept = Kept(options.out, chosen.settings)
-    kept.begin()
+    study = ResumableStudy(options.out, chosen.settings)
+    study.start()
     work: dict[str, Callable[[], dict[str, Any]]] = {
         name: partial(one, options.out, name, seed, chosen.fast) for name, seed in chosen.seeds.items()
     }
-    report(options.out, [scored(name, case) for name, case in kept.run(work, options.jobs).items()])
+    report(options.out, [scored(name, case) for name, case in study.run(work, options.jobs).items()])
 
 
 def report(out: Path, cases: Sequence[Mapping[str, Any]]) -> None:
@@ -134,11 +134,11 @@ def drawn(options: argparse.Namespace) -> Round:
             raise InvalidInput("--cases", got=count, expected=f"at most {usual}", remedy="or --seed")
     elif options.dev:
         secret, seeds = None, list(range(count))
-        if count > case_sampling.DEVELOPMENT:
-            raise InvalidInput("--cases", got=count, expected=f"at most {case_sampling.DEVELOPMENT} for development")
+        if count > case_sampling.DEVELOPMENT_SEEDS:
+            raise InvalidInput("--cases", got=count, expected=f"at most {case_sampling.DEVELOPMENT_SEEDS} for development")
     else:
         secret = _secret(options)
-        seeds = case_sampling.sealed(secret, count)
+        seeds = case_sampling.draw_sealed_seeds(secret, count)
     settings = {"study": "hidden", "secret": secret, "fast": options.fast}
     return Round({f"{k:03d}": seed for k, seed in enumerate(seeds, 1)}, options.fast, settings)
 
@@ -183,7 +183,7 @@ def experiments(
     if not proposed:
         return {"proposed": None, "random": None}
     rng = np.random.default_rng([seed, 17])
-    drawn = {"motion": str(rng.choice(motions.NAMES)), "heading": float(rng.choice(HEADINGS)), "speed": 1.0}
+    drawn = {"motion": str(rng.choice(motions.MOTION_NAMES)), "heading": float(rng.choice(HEADINGS)), "speed": 1.0}
     found = {}
     for which, plan in (("proposed", turned(proposed, given)), ("random", drawn)):
         folder = out / "episodes" / f"{name}-{which}"
@@ -195,8 +195,8 @@ def experiments(
 
 def turned(plan: Mapping[str, Any], given: Sequence[Path]) -> dict[str, Any]:
     """An experiment with its heading from the world's x, which is not where the episode that it repeats begins."""
-    template = next(r for e, r in possible([read(path) for path in given]) if e.motion == plan["motion"])
-    return {**plan, "heading": plan["heading"] + float(np.rad2deg(heading_of(template)))}
+    template = next(r for e, r in list_experiments([read(path) for path in given]) if e.motion == plan["motion"])
+    return {**plan, "heading": plan["heading"] + float(np.rad2deg(measure_heading(template)))}
 
 
 def _gain(

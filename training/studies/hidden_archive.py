@@ -6,7 +6,7 @@ line is one case: its ``name``, and what ``studies hidden`` wrote to ``cases/NAM
 
 Old files keep the keys of their time. ``RENAMED_KEYS`` is the only place that knows them.
 
-    python -m torchcloth.training.studies.hidden_archive DIR COMMIT docs/hidden/rounds    # DIR: --out of the study
+    python -m torchcloth.training.studies.hidden_archive DIR COMMIT docs/validation/blind-rounds/answers    # DIR: --out of the study
 """
 
 from __future__ import annotations

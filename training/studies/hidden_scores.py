@@ -71,7 +71,7 @@ def wanted(truth: Truth) -> list[Wanted]:
     return [
         Wanted(e["name"], frozenset(e["names"]), e["amplitude"] * (e["sign"] or 1.0), bool(e["sign"]), e["hypothesis"])
         for e in truth["effects"]
-        if e["names"] and not e["beside"]
+        if e["names"] and not e["is_enabling"]
     ]
 
 
@@ -116,8 +116,8 @@ def shows(truth: Truth, sizes: Sequence[Mapping[str, Any]] | None) -> list[bool]
     """
     if sizes is None:
         return None
-    left = {row["name"]: row["left_moves"] > MOVED or row["left_pulls"] > PULLED for row in sizes}
-    return [left.get(e["name"], True) for e in truth["effects"] if not e["beside"]]
+    left = {row["name"]: row["unexplained_displacement_rms_m"] > MOVED or row["unexplained_force_rms_n"] > PULLED for row in sizes}
+    return [left.get(e["name"], True) for e in truth["effects"] if not e["is_enabling"]]
 
 
 def verdict(answer: Answer) -> str:
@@ -199,7 +199,7 @@ def said_alike(truth: Truth, answer: Answer, causes: Sequence[Named]) -> bool:
         return any(effect(name) in names for name in listed)
     if any(c.alone and c.best not in fine(truth) for c in causes):
         return False
-    return any(c.all & names and (len(c.all) > 1 or like.get("soft", False)) for c in causes)
+    return any(c.all & names and (len(c.all) > 1 or like.get("may_be_separable", False)) for c in causes)
 
 
 def told_apart(truth: Truth, answer: Answer) -> bool:

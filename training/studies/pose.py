@@ -1,8 +1,7 @@
-"""Pose estimation: the full mesh from partly hidden, noisy clouds, against another engine's truth.
+"""Pose estimation: the full mesh from partly hidden, noisy clouds, with truth from another engine.
 
-MuJoCo moves a knitted sheet of 0.3 m, with air drag; a third of it is hidden behind something that passes, points carry
-noise and a slowly varying bias as a Kinect's do. The truth is read only to score. Beside the estimate: what one has
-without it.
+MuJoCo moves a knitted sheet of 0.3 m with air drag. A passing object hides a third of it. Points have noise and a
+slowly varying bias, as those of a Kinect. The truth is used for scoring only. The estimate is compared with baselines.
 """
 
 from __future__ import annotations
@@ -29,36 +28,45 @@ from torchcloth.recordings import Recording, read
 
 from ..resumable import ResumableStudy
 from ..validation.independent.flex_sheet import SheetSpec, interpolate_bilinear
-from .geometric_baselines import registered, snapped
+from .geometric_baselines import register_frames, snap_to_points
 
-DRAG = 1.2  # of the truth; its membrane has the data sheet's value
-HIDDEN = ["air.drag_n=1.2", "obs.occlusion=0.3", "obs.bias=0.0007"]
-REACH = 0.03  # m, of the snapping
-PICTURE = ("swing-fast", "known to a factor of 2")
+TRUE_DRAG_COEFFICIENT = 1.2  # the true membrane has the data sheet's value
+GENERATOR_EFFECTS = ["air.drag_n=1.2", "obs.occlusion=0.3", "obs.bias=0.0007"]
+SNAP_DISTANCE_M = 0.03
+PICTURE_CASE = ("swing-fast", "known to a factor of 2")
 Uncertain = dict[str, tuple[float, float]]
 
 
 class Setting(NamedTuple):
-    """How much is done."""
+    """Size of the study.
+
+    Attributes:
+        motions: names.
+        nodes: along each side of the true mesh.
+        fit: nodes along each side of the estimate's mesh.
+        modes: of the corrective force.
+        window: time over which the force is constant [s].
+        models: which are used for the estimate.
+    """
 
     motions: tuple[str, ...] = ("swing-fast", "shake")
-    nodes: int = 17  # along the truth's sides
-    fit: int = 9  # along those of the estimate's mesh
+    nodes: int = 17
+    fit: int = 9
     modes: int = 8
     window: float = 0.15
     models: tuple[str, ...] = ("true values", "identified", "wrong by 2, taken as exact", "known to a factor of 2")
 
 
-FAST = Setting(("swing-fast",), 13, 7, 4, 0.3, ("true values", "wrong by 2, taken as exact"))
+FAST_SETTING = Setting(("swing-fast",), 13, 7, 4, 0.3, ("true values", "wrong by 2, taken as exact"))
 
 
 def add(parser: argparse.ArgumentParser) -> None:
-    """Nothing but what every study has."""
+    """Add no options besides those of every study."""
 
 
 def run(options: argparse.Namespace) -> None:
-    """Every motion with every model; a table, and a picture."""
-    setting = FAST if options.fast else Setting()
+    """Estimate each motion with each model; print a table and write a picture."""
+    setting = FAST_SETTING if options.fast else Setting()
     study = ResumableStudy(options.out, {"study": "pose", **{key: _plain(value) for key, value in setting._asdict().items()}})
     study.start()
     cases: dict[str, Callable[[], dict[str, Any]]] = {}
@@ -66,30 +74,36 @@ def run(options: argparse.Namespace) -> None:
         cases[f"{motion}, geometry"] = lambda motion=motion: _geometry(_scene(options.out, setting, motion))
         for model in setting.models:
             cases[f"{motion}, {model}"] = lambda motion=motion, model=model: _case(options.out, setting, motion, model)
-    found = study.run(cases)
-    rows = [row for name, case in found.items() for row in _rows(name, case)]
+    result = study.run(cases)
+    rows = [row for name, case in result.items() for row in _rows(name, case)]
     _print(rows)
     write_text(options.out / "table.md", _markdown(rows))
 
 
 def _plain(value: Any) -> Any:
-    """As JSON gives it back."""
+    """Return a value as JSON gives it back."""
     return list(value) if isinstance(value, tuple) else value
 
 
 class Scene(NamedTuple):
-    """A recording, and where the mesh's vertices truly were."""
+    """A recording and the true vertices.
+
+    Attributes:
+        recording: data.
+        truth: [T, V, 3] m.
+        hidden: [T, V] bool, whether no point is near the true place.
+    """
 
     recording: Recording
-    truth: Tensor  # [T, V, 3] m
-    hidden: Tensor  # [T, V] bool, no point near the true place
+    truth: Tensor
+    hidden: Tensor
 
 
 def _scene(out: Path, setting: Setting, motion: str) -> Scene:
-    """Made by a process of its own, once."""
+    """Generate the scene once, in a separate process."""
     path = out / "episodes" / motion
     if not path.is_dir():
-        effects = [part for effect in HIDDEN for part in ("--effect", effect)]
+        effects = [part for effect in GENERATOR_EFFECTS for part in ("--effect", effect)]
         sizes = ["--nodes", str(setting.nodes), "--fit-nodes", str(setting.fit)]
         script = [sys.executable, "-m", "torchcloth.training.validation.independent.generate", "--motion", motion, "--seed", "1"]
         done = subprocess.run([*script, *sizes, *effects, "--out", str(path)], capture_output=True, text=True)
@@ -103,18 +117,18 @@ def _scene(out: Path, setting: Setting, motion: str) -> Scene:
 
 
 def _at(recording: Recording, cloth: tc.Cloth, times: np.ndarray) -> Tensor:
-    """[T, V, 3] m, the truth at the vertices of a coarser mesh."""
+    """Return [T, V, 3] m, the truth at the vertices of a coarser mesh."""
     from scipy.interpolate import CubicSpline
 
-    found = recording.require("truth", by="the study")
-    side = round(len(found.vertices[0]) ** 0.5)
+    result = recording.require("truth", by="the study")
+    side = round(len(result.vertices[0]) ** 0.5)
     width, height = np.ptp(np.asarray(cloth.mesh.uv), axis=0)
     spec = SheetSpec(width, height, nodes=(side, side))
-    frames = CubicSpline(found.t, found.vertices)(times)
+    frames = CubicSpline(result.t, result.vertices)(times)
     return torch.as_tensor(np.stack([interpolate_bilinear(spec, x, cloth.mesh.uv)[0] for x in frames]))
 
 
-def _cloth(recording: Recording, stiffness: float = 1.0, drag: float = DRAG) -> tc.Cloth:
+def _cloth(recording: Recording, stiffness: float = 1.0, drag: float = TRUE_DRAG_COEFFICIENT) -> tc.Cloth:
     nominal = recording.cloth.nominal
     bending = Bending(nominal["bending_stiffness"], nominal["bending_damping_time"])
     effects = {"gravity": Gravity(recording.gravity.tolist()), "bending": bending, "air": AirDrag(drag)}
@@ -128,22 +142,22 @@ def _stiffness(cloth: tc.Cloth) -> tc.PhysicalParameter:
 
 
 def _model(recording: Recording, name: str) -> tuple[tc.Cloth, Uncertain]:
-    """The cloth, and what is said to be uncertain of it."""
+    """Return the cloth and its uncertain parameters."""
     if name == "true values":
         return _cloth(recording), {}
-    wrong = _cloth(recording, 0.5, 0.5 * DRAG)
+    wrong = _cloth(recording, 0.5, 0.5 * TRUE_DRAG_COEFFICIENT)
     if name == "wrong by 2, taken as exact":
         return wrong, {}
     if name == "identified":
         return _identified(wrong, recording)
     stiffness = float(_stiffness(wrong).value.detach())
-    return wrong, {"youngs_modulus": (stiffness, 2.0), "air.normal": (0.5 * DRAG, 0.5 * DRAG)}
+    return wrong, {"youngs_modulus": (stiffness, 2.0), "air.normal": (0.5 * TRUE_DRAG_COEFFICIENT, 0.5 * TRUE_DRAG_COEFFICIENT)}
 
 
 def _identified(start: tc.Cloth, recording: Recording) -> tuple[tc.Cloth, Uncertain]:
-    """The fit's values and errors, a factor of 2 where it calls them not identifiable: its search ended there.
+    """Return the cloth of a fit with its standard errors, at most a factor of 2.
 
-    Drag that ended at nothing stays there.
+    Drag that was fitted to zero has no uncertainty.
     """
     fit = tc.identify(start, recording, ["youngs_modulus", "air.normal"])
     stiff, drag = fit.parameters["youngs_modulus"], fit.parameters["air.normal"]
@@ -156,57 +170,57 @@ def _identified(start: tc.Cloth, recording: Recording) -> tuple[tc.Cloth, Uncert
 
 
 def _geometry(scene: Scene) -> dict[str, Any]:
-    """Without physics: carried, snapped, registered."""
+    """Compute the baselines without physics."""
     cloth = _cloth(scene.recording)
     data = identification.build_episode(cloth, scene.recording)
-    held = torch.cat([part.index for part in cloth.boundaries.values()])  # type: ignore[misc]
+    gripped = torch.cat([part.index for part in cloth.boundaries.values()])  # type: ignore[misc]
     carried = identification.carry_rigidly(data)
     noise = scene.recording.observation_noise_std or 1e-3
     frames = {
         "carried rigidly": carried,
-        "carried, snapped to the nearest points": snapped(carried, data, REACH),
-        "registered frame by frame": registered(data, cloth.mesh, held, scene.truth[:, held], noise),
+        "carried, snapped to the nearest points": snap_to_points(carried, data, SNAP_DISTANCE_M),
+        "registered frame by frame": register_frames(data, cloth.mesh, gripped, scene.truth[:, gripped], noise),
     }
     return {name: _errors(x, scene) for name, x in frames.items()}
 
 
 def _case(out: Path, setting: Setting, motion: str, model: str) -> dict[str, Any]:
-    """One estimate."""
+    """Compute one estimate and its errors."""
     scene = _scene(out, setting, motion)
     cloth, uncertain = _model(scene.recording, model)
-    found = estimate_pose(cloth, scene.recording, uncertain=uncertain, modes=setting.modes, window=setting.window)
-    if (motion, model) == PICTURE:
-        film = viewing.film_from_pose(scene.recording, found, truth=True)
+    result = estimate_pose(cloth, scene.recording, uncertain=uncertain, modes=setting.modes, window=setting.window)
+    if (motion, model) == PICTURE_CASE:
+        film = viewing.film_from_pose(scene.recording, result, truth=True)
         viewing.write_png(film, out / "pose.png", size=(520, 440))
     free = torch.ones(len(cloth.mesh.vertices), dtype=torch.bool)
     for part in cloth.boundaries.values():
         free[part.index] = False  # type: ignore[index]
     return {
-        "simulated": _errors(found.uncorrected, scene),
-        "estimated": _errors(found.x, scene) | _coverage(found, scene, free) | _figures(found),
+        "simulated": _errors(result.uncorrected, scene),
+        "estimated": _errors(result.x, scene) | _coverage(result, scene, free) | _figures(result),
     }
 
 
 def _errors(x: Tensor, scene: Scene) -> dict[str, float]:
-    """Root mean square distances from the truth [mm]."""
+    """Return root mean square distances from the truth [mm]."""
     squared = (x - scene.truth).square().sum(-1)
     return {"all": 1e3 * float(squared.mean().sqrt()), "hidden": 1e3 * float(squared[scene.hidden].mean().sqrt())}
 
 
-def _coverage(found: PoseEstimate, scene: Scene, free: Tensor) -> dict[str, float]:
-    inside = ((found.x - scene.truth).abs() < 1.96 * found.std).double()
+def _coverage(result: PoseEstimate, scene: Scene, free: Tensor) -> dict[str, float]:
+    inside = ((result.x - scene.truth).abs() < Z_95 * result.std).double()
     hidden = inside[scene.hidden & free]
     return {"coverage": float(inside[:, free].mean()), "coverage_hidden": float(hidden.mean())}
 
 
-def _figures(found: PoseEstimate) -> dict[str, Any]:
+def _figures(result: PoseEstimate) -> dict[str, Any]:
     names = ("std_rms", "force_share", "seconds", "converged")
-    return {**{name: found.fit[name] for name in names}, "warnings": found.warnings}
+    return {**{name: result.fit[name] for name in names}, "warnings": result.warnings}
 
 
 # -- what is printed --------------------------------------------------------------------------------------------------
 
-HEADINGS = (
+TABLE_HEADINGS = (
     "motion",
     "method",
     "all, mm",
@@ -221,18 +235,18 @@ HEADINGS = (
 def _rows(name: str, case: Mapping[str, Mapping[str, Any]]) -> list[tuple[str, ...]]:
     motion, model = name.split(", ", 1)
     out = []
-    for method, own in case.items():
+    for method, values in case.items():
         label = method if model == "geometry" else f"{method}: {model}"
-        more = ("–",) * 4
-        if "coverage" in own:
-            shares = (_shown(own[key], 3) for key in ("coverage", "coverage_hidden"))
-            more = (*shares, f"{1e3 * own['std_rms']:.2f}", f"{100 * own['force_share']:.1f} %")
-        out.append((motion, label, f"{own['all']:.2f}", _shown(own["hidden"], 2), *more))
+        coverage_cells = ("–",) * 4
+        if "coverage" in values:
+            shares = (_shown(values[key], 3) for key in ("coverage", "coverage_hidden"))
+            coverage_cells = (*shares, f"{1e3 * values['std_rms']:.2f}", f"{100 * values['force_share']:.1f} %")
+        out.append((motion, label, f"{values['all']:.2f}", _shown(values["hidden"], 2), *coverage_cells))
     return out
 
 
 def _shown(value: float | None, digits: int) -> str:
-    """A dash where nothing is hidden."""
+    """Format a value; a dash if nothing is hidden."""
     return "–" if value is None else f"{value:.{digits}f}"
 
 
@@ -246,7 +260,7 @@ def _print(rows: list[tuple[str, ...]]) -> None:
     table = Table(
         title="Distance from the truth, rms over vertices and frames", title_justify="left", box=box.SIMPLE_HEAD
     )
-    for k, heading in enumerate(HEADINGS):
+    for k, heading in enumerate(TABLE_HEADINGS):
         table.add_column(heading, justify="left" if k < 2 else "right", no_wrap=True)
     for row in rows:
         table.add_row(*row)
@@ -254,5 +268,5 @@ def _print(rows: list[tuple[str, ...]]) -> None:
 
 
 def _markdown(rows: list[tuple[str, ...]]) -> str:
-    lines = [HEADINGS, ("---", "---", *("---:",) * (len(HEADINGS) - 2)), *rows]
+    lines = [TABLE_HEADINGS, ("---", "---", *("---:",) * (len(TABLE_HEADINGS) - 2)), *rows]
     return "".join(f"| {' | '.join(line)} |\n" for line in lines)

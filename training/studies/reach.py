@@ -19,8 +19,8 @@ import numpy as np
 import torch
 
 from torchcloth import planning
-from torchcloth.identification import build_cloth, load_fitted_cloth, identify
-from torchcloth.identification.io.saved_fit import RESULT
+from torchcloth.identification import build_cloth, identify, load_fitted_cloth
+from torchcloth.identification.result import IDENTIFICATION_FILE_NAME
 from torchcloth.losses import chamfer_to_surface
 from torchcloth.planning import Goal
 from torchcloth.recordings import Recording
@@ -36,13 +36,13 @@ from ..validation.independent.scene import simulate
 from ..validation.independent.sensor import sample_points
 from .manipulations.console_tables import heading_table, mm, show, write
 
-FIT = "fit"
-LEARNT = ("stretch", "swing")  # motions that the fabric is fitted to
-WRONG = {"membrane_stiffness": 3.0, "bending_stiffness": 0.4}  # times the truth, on the data sheet
-DRAG = 1.2
-FAR = 0.08  # m, of the hidden path's end from the known one's, along each axis
-TURN = 0.3  # rad about the vertical, likewise of the hands
-METHODS: dict[str, dict[str, Any]] = {
+FIT_CASE = "fit"
+FIT_MOTIONS = ("stretch", "swing")  # motions that the fabric is fitted to
+NOMINAL_FACTORS = {"membrane_stiffness": 3.0, "bending_stiffness": 0.4}  # times the truth, on the data sheet
+TRUE_DRAG_COEFFICIENT = 1.2
+GOAL_SHIFT_M = 0.08  # m, of the hidden path's end from the known one's, along each axis
+GOAL_TURN_RAD = 0.3  # rad about the vertical, likewise of the hands
+PLAN_OPTIONS: dict[str, dict[str, Any]] = {
     "fitted": {},
     "data sheet": {},
     "adam": {"method": "adam", "iterations": 60},  # with the fitted values
@@ -59,14 +59,14 @@ class Scale:
     iterations: int = 12  # of the plan's Gauss-Newton
 
 
-FAST = Scale(motions=("swing-fast",), nodes=13, fit_nodes=9, iterations=5)
+FAST_SCALE = Scale(motions=("swing-fast",), nodes=13, fit_nodes=9, iterations=5)
 
 
 class Scene(NamedTuple):
     """Another engine's cloth, and what is said of it."""
 
     true: Any
-    said: Any  # whose values the data sheet has
+    stated: Any  # whose values the data sheet has
 
 
 def add(parser: argparse.ArgumentParser) -> None:
@@ -77,101 +77,101 @@ def add(parser: argparse.ArgumentParser) -> None:
 def run(options: argparse.Namespace) -> None:
     """Fit the fabric, then every case; print and write reach.json."""
     check_jobs(options.jobs)
-    scale = FAST if options.fast else Scale()
+    scale = FAST_SCALE if options.fast else Scale()
     study = ResumableStudy(options.out, {"study": "reach", **asdict(scale)})
-    folder = options.out / FIT
-    cases: dict[str, Callable[[], dict[str, Any]]] = {FIT: partial(learn, scale, folder)}
-    found = study.run(cases)
-    cases = {f"{k}-{name}": partial(reach, scale, k, name, folder) for k, name in enumerate(scale.motions)}
-    found |= study.run(cases, options.jobs)
-    show(_table(found), NOTE)
-    write(options.out / "reach.json", found)
+    folder = options.out / FIT_CASE
+    cases: dict[str, Callable[[], dict[str, Any]]] = {FIT_CASE: partial(fit_fabric, scale, folder)}
+    results = study.run(cases)
+    cases = {f"{k}-{name}": partial(plan_and_execute, scale, k, name, folder) for k, name in enumerate(scale.motions)}
+    results |= study.run(cases, options.jobs)
+    show(_table(results), TABLE_NOTE)
+    write(options.out / "reach.json", results)
 
 
-def scene(scale: Scale) -> Scene:
+def build_scenes(scale: Scale) -> Scene:
     """A knit in air, and the same with what a wrong data sheet says of it."""
     make = IndependentScene()
     true = replace(make, sheet=replace(make.sheet, nodes=(scale.nodes, scale.nodes)))
-    said = replace(
+    stated = replace(
         true,
-        sheet=replace(true.sheet, membrane_stiffness=WRONG["membrane_stiffness"] * true.sheet.membrane_stiffness),
-        plate=replace(true.plate, stiffness=WRONG["bending_stiffness"] * true.plate.stiffness),
+        sheet=replace(true.sheet, membrane_stiffness=NOMINAL_FACTORS["membrane_stiffness"] * true.sheet.membrane_stiffness),
+        plate=replace(true.plate, stiffness=NOMINAL_FACTORS["bending_stiffness"] * true.plate.stiffness),
     )
-    return Scene(add_effect(true, "air.drag_n", DRAG, {}), said)
+    return Scene(add_effect(true, "air.drag_n", TRUE_DRAG_COEFFICIENT, {}), stated)
 
 
-def learn(scale: Scale, folder: Path) -> dict[str, Any]:
+def fit_fabric(scale: Scale, folder: Path) -> dict[str, Any]:
     """The fabric, from two motions."""
     torch.set_default_dtype(torch.float64)
-    recordings = [_recorded(scale, name, k)[0] for k, name in enumerate(LEARNT)]
+    recordings = [_recorded(scale, name, k)[0] for k, name in enumerate(FIT_MOTIONS)]
     fit = identify(build_cloth(recordings[0]), recordings, nuisances=["grasp"])
     fit.save(folder)
     return {name: {"value": p.value, "std": p.std, "unit": p.unit} for name, p in fit.parameters.items()}
 
 
-def reach(scale: Scale, number: int, name: str, folder: Path) -> dict[str, Any]:
+def plan_and_execute(scale: Scale, number: int, name: str, folder: Path) -> dict[str, Any]:
     """One goal: how far the cloth is from it as recorded, as planned, and when the plan is carried out."""
     torch.set_default_dtype(torch.float64)
-    episode, moved, begun = _recorded(scale, name, 10 + number)
-    cloth = scene(scale).true
-    hidden = _elsewhere(moved, np.random.default_rng([7, number]))
-    there = simulate(cloth, hidden)
-    cloud = sample_points(cloth.sensor, cloth.sheet, hidden.t, there.x, np.random.default_rng([8, number]))
+    episode, motion, recorded_result = _recorded(scale, name, 10 + number)
+    cloth = build_scenes(scale).true
+    hidden_motion = _shift_end(motion, np.random.default_rng([7, number]))
+    goal_result = simulate(cloth, hidden_motion)
+    cloud = sample_points(cloth.sensor, cloth.sheet, hidden_motion.t, goal_result.x, np.random.default_rng([8, number]))
     goal = Goal(torch.as_tensor(cloud.frame(len(cloud) - 1)))
     faces = torch.as_tensor(sheet_mesh(cloth.sheet)[1])
     out: dict[str, Any] = {
-        "noise": _from_goal(goal, there.x[-1], faces),
-        "recorded": _from_goal(goal, begun.x[-1], faces) | {"vertices": _rms(begun.x[-1], there.x[-1])},
+        "noise": _from_goal(goal, goal_result.x[-1], faces),
+        "recorded": _from_goal(goal, recorded_result.x[-1], faces) | {"vertices": _rms(recorded_result.x[-1], goal_result.x[-1])},
     }
-    for label, how in METHODS.items():
-        model = build_cloth(episode) if label == "data sheet" else load_fitted_cloth(folder / RESULT, episode)[0]
+    for label, how in PLAN_OPTIONS.items():
+        model = build_cloth(episode) if label == "data sheet" else load_fitted_cloth(folder / IDENTIFICATION_FILE_NAME, episode)[0]
         began = time.perf_counter()
-        found = planning.plan(model, episode, goal, **({"iterations": scale.iterations, "wait": 0.0} | how))
-        done = simulate(cloth, _along(moved, found.recording))
+        results = planning.plan(model, episode, goal, **({"iterations": scale.iterations, "wait": 0.0} | how))
+        executed = simulate(cloth, _planned_motion(motion, results.recording))
         out[label] = {
-            "before": found.distance_before[0],
-            "expected": found.distance_after[0],
-            **_from_goal(goal, done.x[-1], faces),
-            "vertices": _rms(done.x[-1], there.x[-1]),
-            "looks": len(found.distance_history),
+            "before": results.distance_before[0],
+            "expected": results.distance_after[0],
+            **_from_goal(goal, executed.x[-1], faces),
+            "vertices": _rms(executed.x[-1], goal_result.x[-1]),
+            "looks": len(results.distance_history),
             "seconds": time.perf_counter() - began,
-            "limit": found.nearest_limit,
+            "limit": results.nearest_limit,
         }
     return out
 
 
 def _recorded(scale: Scale, name: str, seed: int) -> tuple[Recording, Any, Any]:
     """(recording, motion, what happened) of a motion by name."""
-    cloth = scene(scale)
-    moved = motions.make_motion(name, cloth.true.sheet)
-    result = simulate(cloth.true, moved)
-    said = make_recording(cloth.true, moved, result, name, seed, scale.fit_nodes, data_sheet_scene=cloth.said)
-    return replace(said, air_density=cloth.true.air.density, truth=None), moved, result
+    cloth = build_scenes(scale)
+    motion = motions.make_motion(name, cloth.true.sheet)
+    result = simulate(cloth.true, motion)
+    stated = make_recording(cloth.true, motion, result, name, seed, scale.fit_nodes, data_sheet_scene=cloth.stated)
+    return replace(stated, air_density=cloth.true.air.density, truth=None), motion, result
 
 
-def _elsewhere(moved: Any, rng: np.random.Generator) -> Any:
+def _shift_end(motion: Any, rng: np.random.Generator) -> Any:
     """The motion with its end elsewhere: both hands shifted and turned about the vertical, ever more on the way."""
     jerk = motions.minimum_jerk
-    t = moved.t
+    t = motion.t
     share = jerk(t, np.array([t[0] + 0.2, t[-1] - 0.2]), np.array([0.0, 1.0]))
-    shift, angle = rng.uniform(-FAR, FAR, 3), rng.uniform(-TURN, TURN)
+    shift, angle = rng.uniform(-GOAL_SHIFT_M, GOAL_SHIFT_M, 3), rng.uniform(-GOAL_TURN_RAD, GOAL_TURN_RAD)
     shift[2] = abs(shift[2])  # up: a table may lie below
-    middle = np.mean([pose[:, :3, 3] for pose in moved.pose.values()], axis=0)
+    middle = np.mean([pose[:, :3, 3] for pose in motion.pose.values()], axis=0)
     turn = motions.rotations_about_z(share * angle)
     pose = {}
-    for name, own in moved.pose.items():
-        new = own.copy()
-        new[:, :3, :3] = turn @ own[:, :3, :3]
-        new[:, :3, 3] = middle + np.einsum("kab,kb->ka", turn, own[:, :3, 3] - middle) + share[:, None] * shift
+    for name, entry in motion.pose.items():
+        new = entry.copy()
+        new[:, :3, :3] = turn @ entry[:, :3, :3]
+        new[:, :3, 3] = middle + np.einsum("kab,kb->ka", turn, entry[:, :3, 3] - middle) + share[:, None] * shift
         pose[name] = new
-    return replace(moved, pose=pose)
+    return replace(motion, pose=pose)
 
 
-def _along(moved: Any, planned: Recording) -> Any:
+def _planned_motion(motion: Any, planned: Recording) -> Any:
     """The planned paths as another engine takes them."""
     paths = replay(planned)
     t = next(iter(paths.values())).t.numpy()
-    return replace(moved, t=t, pose={name: paths[name].pose.numpy() for name in moved.pose})
+    return replace(motion, t=t, pose={name: paths[name].pose.numpy() for name in motion.pose})
 
 
 def _from_goal(goal: Goal, x: np.ndarray, faces: torch.Tensor) -> dict[str, float]:
@@ -182,26 +182,26 @@ def _rms(x: np.ndarray, y: np.ndarray) -> float:
     return float(np.sqrt(np.square(x - y).sum(-1).mean()))
 
 
-NOTE = (
+TABLE_NOTE = (
     "distance: of the goal's points, which carry the sensor's noise, from the cloth at the end (one-sided Chamfer); "
     "expected: as the plan's own simulation has it; done: as MuJoCo does it. vertices: root mean square of where every "
     "piece of cloth is, beside where the hidden path brought it."
 )
 
 
-def _table(found: dict[str, Any]):
+def _table(results: dict[str, Any]):
     title = "Distance from the goal [mm]"
     table = heading_table(title, "motion", "planned with", "expected", "done", "vertices", "motions tried")
-    for name, case in found.items():
-        if name == FIT:
+    for name, case in results.items():
+        if name == FIT_CASE:
             continue
         first = case["recorded"]
         table.add_row(name, "– (as recorded)", "", mm(first["distance"]), mm(first["vertices"]), "")
-        for label in METHODS:
-            own = case[label]
-            cells = [mm(own[key]) for key in ("expected", "distance", "vertices")]
-            said = "fitted, by Adam" if label == "adam" else label
-            table.add_row("", said, *cells, str(own["looks"]))
+        for label in PLAN_OPTIONS:
+            entry = case[label]
+            cells = [mm(entry[key]) for key in ("expected", "distance", "vertices")]
+            stated = "fitted, by Adam" if label == "adam" else label
+            table.add_row("", stated, *cells, str(entry["looks"]))
         table.add_row(
             "", "the hidden path itself", "", mm(case["noise"]["distance"]), mm(0.0), "", "", end_section=True
         )

@@ -1,4 +1,4 @@
-"""Command lines that say something of one case, as JSON."""
+"""Command line of programs that print something about one case as JSON."""
 
 from __future__ import annotations
 
@@ -7,17 +7,19 @@ import json
 import sys
 from collections.abc import Callable
 
-from .case_sampling import REDUCED, SMALL, Case, case
+from .case_sampling import FAST_SIZE, ROUND_SIZE, Case, draw_case
 
 
-def told(about: str | None, of: Callable[[Case], object], arguments: list[str] | None = None) -> int:
-    """Print what ``of`` says of the case that is asked for; returns the exit code."""
-    parser = argparse.ArgumentParser(description=about, formatter_class=argparse.RawDescriptionHelpFormatter)
+def print_case_json(
+    description: str | None, compute: Callable[[Case], object], arguments: list[str] | None = None
+) -> int:
+    """Print the JSON of ``compute(case)`` for the case that the arguments name; return the exit code."""
+    parser = argparse.ArgumentParser(description=description, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seed", type=int, required=True)
-    parser.add_argument("--fast", action="store_true", help="as the case was made")
+    parser.add_argument("--fast", action="store_true", help="if the case was made with --fast")
     options = parser.parse_args(arguments)
     try:
-        print(json.dumps(of(case(options.seed, SMALL if options.fast else REDUCED)), indent=1))
+        print(json.dumps(compute(draw_case(options.seed, FAST_SIZE if options.fast else ROUND_SIZE)), indent=1))
     except ValueError as error:
         print(error, file=sys.stderr)
         return 2

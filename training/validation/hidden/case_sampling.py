@@ -1,7 +1,7 @@
-"""A hidden case is a function of a number: family, effects, amplitudes, fabric, motions, noise.
+"""Draw hidden cases. A case is a function of a seed: family, effects, amplitudes, fabric, motions, noise.
 
-Numbers 0 to 999 are for development: thresholds may be tuned on them. Sealed ones begin at 100 000; a round draws them
-from a secret. Twenty numbers in a row hold every family at its share.
+Seeds 0 to 999 are for development: thresholds may be tuned on them. Sealed seeds begin at 100 000; a round draws them
+from a secret. Twenty seeds in a row hold every family in its proportion.
 """
 
 from __future__ import annotations
@@ -13,75 +13,105 @@ from typing import Any
 import numpy as np
 
 from ..independent.effects import CATALOGUE
-from ..independent.sensor import EYE, TARGET
-from .effect_map import DRAGGED, FOLDED, OUTSIDE, PAIRS, SINGLES, Partner
+from ..independent.sensor import EYE_M, TARGET_M
+from .effect_map import DRAG_MOTIONS, FOLD_MOTIONS, OUTSIDE_EFFECTS, PAIRED_EFFECTS, SINGLE_EFFECTS, EffectMapping
 
-DEVELOPMENT, SEALED = 1000, 100_000
-HALF, FULL, MORE = 0.5, 1.0, 1.5  # of typical
-ROUND = (
+DEVELOPMENT_SEEDS = 1000  # seeds below
+FIRST_SEALED_SEED = 100_000
+HALF_SIZE, TYPICAL_SIZE, LARGE_SIZE = 0.5, 1.0, 1.5  # of the typical amplitude
+FAMILY_CYCLE = (
     *("null", "null", "hard null", "hard null", "hard null", "hard null"),
     *("single", "single", "single", "single", "single", "single"),
     *("double", "double", "confounded", "confounded", "outside", "outside", "fault", "next experiment"),
 )
-CONFOUNDED = ("tilt or wind", "base or extrinsic", "mass without forces", "damping or drag")
-FAULTS = ("clock jump", "swapped grippers", "wrong unit", "mirrored")
-Plan = tuple[str, float, float]  # motion, heading in degrees, speed
+CONFOUNDED_KINDS = ("tilt or wind", "base or extrinsic", "mass without forces", "damping or drag")
+FAULT_KINDS = ("clock jump", "swapped grippers", "wrong unit", "mirrored")
+HEADINGS_DEG = (0.0, 90.0, 180.0, 270.0)
+FABRIC_STIFFNESSES = ("membrane_stiffness", "bending_stiffness")
+# Some effects need special motions. This fraction of the other cases on a table has one of these motions as well, so
+# that the motion alone does not reveal the effect.
+DECOY_MOTION_FRACTION = 0.4
+PLACEMENT_RANGE_M = 0.02  # nobody puts a sheet down more exactly
+CAMERA_POSITION_STD_M, CAMERA_ROLL_STD_RAD = 0.05, 0.03  # of a rig's camera: where it stands and looks, how level
+HEADING_RANGE_DEG = 8.0  # by which a person misses a heading
+SPEED_RANGE = (0.95, 1.05)  # likewise a speed
+
+MotionPlan = tuple[str, float, float]  # motion, heading [degrees], speed factor
+Fields = dict[str, Any]  # of a Case
 
 
 @dataclass(frozen=True)
-class Size:
-    """How large a case is.
+class CaseSize:
+    """Meshes and motions of a case.
 
     Attributes:
-        nodes: vertices along the truth's sides; fit: along those of the recordings' mesh.
-        free, table: motions in the air, and with one on a table.
-        pad: m, within which the truth holds vertices: five of its edges and beside them one, the roundest of patches.
-        pads: m, between which grippers hold; lines of the truth's vertices are moved to where that ends.
+        nodes: vertices along the truth's sides.
+        fit_nodes: vertices along the sides of the recordings' mesh.
+        hanging: motions of cases without a table.
+        table: motions of cases with one motion on a table.
+        vertex_radius: m, within which the truth holds vertices: five of its edges and one more, the roundest patch.
+        grip_radii: m, range of the grippers' radii. Grid lines of the truth are moved to the edge of the grip.
     """
 
     nodes: int
-    fit: int
-    free: tuple[Plan, ...]
-    table: tuple[Plan, ...]
-    pad: float
-    pads: tuple[float, float] = (0.042, 0.058)
+    fit_nodes: int
+    hanging: tuple[MotionPlan, ...]
+    table: tuple[MotionPlan, ...]
+    vertex_radius: float
+    grip_radii: tuple[float, float] = (0.042, 0.058)
 
 
-_COMMON: tuple[Plan, ...] = (
+_COMMON_MOTIONS: tuple[MotionPlan, ...] = (
     ("swing-fast", 0.0, 1.0),
     ("swing", 90.0, 1.8),
     ("stretch", 0.0, 1.5),
     ("turn", 0.0, 2.0),
     ("hang", 90.0, 2.0),
 )
-REDUCED = Size(29, 13, (*_COMMON, ("shake", 0.0, 1.5)), (*_COMMON, ("drag-fast", 0.0, 1.0)), 0.0557)
-_FAST: Plan = ("swing-fast", 0.0, 1.3)
-SMALL = Size(21, 9, (_FAST, ("turn", 0.0, 3.0)), (_FAST, ("drag-fast", 0.0, 1.3)), 0.0785, (0.075, 0.075))
-UNSEEN: Plan = ("swing", 45.0, 1.4)  # of no case
-LIKE_OTHERS = 0.4  # share of cases on a table with one of the motions that some effects need: those tell nothing, then
-START = 0.02  # m, within which nobody puts a sheet down more exactly
-CAMERA, ROLL = 0.05, 0.03  # m and rad, standard deviations of where a rig's camera stands and looks, and how level
+ROUND_SIZE = CaseSize(
+    29, 13, (*_COMMON_MOTIONS, ("shake", 0.0, 1.5)), (*_COMMON_MOTIONS, ("drag-fast", 0.0, 1.0)), 0.0557
+)
+_FAST_SWING: MotionPlan = ("swing-fast", 0.0, 1.3)
+FAST_SIZE = CaseSize(
+    21, 9, (_FAST_SWING, ("turn", 0.0, 3.0)), (_FAST_SWING, ("drag-fast", 0.0, 1.3)), 0.0785, (0.075, 0.075)
+)
+UNSEEN_MOTION: MotionPlan = ("swing", 45.0, 1.4)  # no case has it
 
 
 @dataclass(frozen=True)
-class Hidden:
-    """An effect by the generator's name."""
+class HiddenEffect:
+    """An effect of the independent engine.
+
+    Attributes:
+        name: in the engine's catalogue.
+        amplitude: SI.
+        options: of the engine's effect, e.g. the heading.
+        typical_fraction: amplitude over the typical one.
+    """
 
     name: str
     amplitude: float
     options: dict[str, float] = field(default_factory=dict)
-    share: float = 1.0  # of the typical amplitude
+    typical_fraction: float = 1.0
 
 
 @dataclass(frozen=True)
-class Take:
-    """One episode."""
+class EpisodePlan:
+    """One episode.
+
+    Attributes:
+        motion: name.
+        heading: degrees.
+        speed: factor.
+        effects: hidden in this episode only.
+        start: m, x and y by which the sheet and the grippers are displaced from the usual place.
+    """
 
     motion: str
-    heading: float  # degrees
+    heading: float
     speed: float
-    own: tuple[Hidden, ...] = ()  # differs from episode to episode
-    start: tuple[float, float] = (0.0, 0.0)  # m, by which the sheet and the grippers are beside the usual place
+    effects: tuple[HiddenEffect, ...] = ()
+    start: tuple[float, float] = (0.0, 0.0)
 
 
 @dataclass(frozen=True)
@@ -89,146 +119,163 @@ class Case:
     """What is hidden in which episodes.
 
     Attributes:
-        seed, family, kind: kind says more within a family: "full", "tilt or wind", ...
-        size: of meshes.
+        seed: determines everything else.
+        family: one of ``FAMILY_CYCLE``.
+        kind: says more within a family, e.g. the fraction of the typical amplitude, or "tilt or wind".
+        size: of meshes and motions.
         effects: hidden in all episodes.
-        takes: the episodes, in the order in which they are written.
-        fabric: values of the true fabric; said: data sheet's values over them.
-        bias, occlusion: of the sensor; diagonals: of the truth's mesh.
-        pad: m, that grippers hold.
-        forces: measured.
-        camera: where it is, of the sensor.
+        episodes: in the order in which they are written.
+        fabric: true values of the fabric.
+        data_sheet_ratio: the data sheet's values over the true ones.
+        bias: m, slowly varying depth error of the sensor.
+        occlusion: -, fraction of the surface that is hidden from the sensor.
+        nodes: vertices along the truth's sides.
+        diagonals: of the truth's mesh.
+        grip_radius: m.
+        has_forces: gripper forces are recorded.
         fault: of the recording, or "".
+        camera: position, target and roll of the sensor.
     """
 
     seed: int
     family: str
     kind: str
-    size: Size
-    effects: tuple[Hidden, ...]
-    takes: tuple[Take, ...]
+    size: CaseSize
+    effects: tuple[HiddenEffect, ...]
+    episodes: tuple[EpisodePlan, ...]
     fabric: dict[str, float]
-    said: dict[str, float]
+    data_sheet_ratio: dict[str, float]
     bias: float = 0.35e-3
     occlusion: float = 0.0
-    nodes: int = REDUCED.nodes
+    nodes: int = ROUND_SIZE.nodes
     diagonals: str = "alternating"
-    pad: float = 0.05
-    forces: bool = True
+    grip_radius: float = 0.05
+    has_forces: bool = True
     fault: str = ""
     camera: dict[str, Any] = field(default_factory=dict)
 
     @property
-    def sealed(self) -> bool:
-        """Never to be tuned on."""
-        return self.seed >= SEALED
+    def is_sealed(self) -> bool:
+        """Whether nothing may be tuned on this case."""
+        return self.seed >= FIRST_SEALED_SEED
 
-    def take(self, plan: Plan) -> Take:
-        """A further episode of this case with another motion."""
-        return Take(*plan, start=_start(self.seed, plan))
+    def plan_episode(self, motion: MotionPlan) -> EpisodePlan:
+        """Return a further episode of this case with another motion."""
+        return EpisodePlan(*motion, start=_draw_placement(self.seed, motion))
 
 
-def case(seed: int, size: Size = REDUCED) -> Case:
-    """The case of a number.
+def draw_case(seed: int, size: CaseSize = ROUND_SIZE) -> Case:
+    """Return the case of a seed.
 
     Raises:
-        ValueError: a number that is neither for development nor sealed.
+        ValueError: a seed that is neither for development nor sealed.
     """
-    if not (0 <= seed < DEVELOPMENT or seed >= SEALED):
-        raise ValueError(f"seed {seed}: expected 0 to {DEVELOPMENT - 1}, or {SEALED} and more")
+    if not (0 <= seed < DEVELOPMENT_SEEDS or seed >= FIRST_SEALED_SEED):
+        raise ValueError(f"seed {seed}: expected 0 to {DEVELOPMENT_SEEDS - 1}, or {FIRST_SEALED_SEED} and more")
     rng = np.random.default_rng([seed, 7])
-    family, turn, slot = ROUND[seed % len(ROUND)], seed // len(ROUND), seed % len(ROUND)
-    slot -= ROUND.index(family)
-    draw = {
-        "null": _null,
-        "hard null": _hard,
-        "single": _single,
-        "double": _double,
-        "confounded": _confounded,
-        "outside": _outside,
-        "fault": _fault,
-        "next experiment": _next,
+    cycle, position = divmod(seed, len(FAMILY_CYCLE))
+    family = FAMILY_CYCLE[position]
+    index = position - FAMILY_CYCLE.index(family)  # among the cycle's cases of this family
+    draw_family = {
+        "null": _draw_null,
+        "hard null": _draw_hard_null,
+        "single": _draw_single,
+        "double": _draw_double,
+        "confounded": _draw_confounded,
+        "outside": _draw_outside,
+        "fault": _draw_fault,
+        "next experiment": _draw_next_experiment,
     }[family]
-    parts = {"kind": "", "effects": (), "plans": _plans(size, rng)} | draw(rng, turn, slot, size)
-    regrasp, plans = parts.pop("regrasp", 0.0), _like_others(parts.pop("plans"), seed, size)
-    takes = _balanced(tuple(_take(plan, regrasp, rng) for plan in plans), regrasp)
-    takes = [replace(take, start=_start(seed, (take.motion, take.heading, take.speed))) for take in takes]
-    order = rng.permutation(len(takes))
-    given = {"nodes": size.nodes, "fabric": _fabric(rng), "said": _sheet(rng, 0.15)} | parts
-    pad = float(np.random.default_rng([seed, 17]).uniform(*size.pads))
-    ordered = tuple(takes[k] for k in order)
-    return Case(seed, family, size=size, takes=ordered, pad=pad, camera=_camera(seed), **given)
+    fields = {"kind": "", "effects": (), "motions": _draw_motions(size, rng)} | draw_family(rng, cycle, index, size)
+    regrasp, motions = fields.pop("regrasp", 0.0), _with_decoy_motions(fields.pop("motions"), seed, size)
+    episodes = _balance_regrasps(tuple(_draw_episode(motion, regrasp, rng) for motion in motions), regrasp)
+    placed = [replace(e, start=_draw_placement(seed, (e.motion, e.heading, e.speed))) for e in episodes]
+    order = rng.permutation(len(placed))
+    fields = {
+        "nodes": size.nodes,
+        "fabric": _draw_fabric(rng),
+        "data_sheet_ratio": _draw_data_sheet_ratio(rng, 0.15),
+    } | fields
+    grip_radius = float(np.random.default_rng([seed, 17]).uniform(*size.grip_radii))
+    ordered = tuple(placed[k] for k in order)
+    return Case(seed, family, size=size, episodes=ordered, grip_radius=grip_radius, camera=_draw_camera(seed), **fields)
 
 
-def sealed(secret: int, count: int) -> list[int]:
-    """``count`` sealed numbers; every twenty hold the families at their shares, in an order that tells nothing."""
+def draw_sealed_seeds(secret: int, count: int) -> list[int]:
+    """Return ``count`` sealed seeds, of which every twenty hold the families in their proportions.
+
+    The order says nothing about the family. A larger count begins with the same seeds.
+    """
     rng = np.random.default_rng([secret, 11])
-    found: list[int] = []
-    while len(found) < count:  # as many as asked for, or more: the first are the same
-        turn = int(rng.integers(10**9))
-        found += [SEALED + turn * len(ROUND) + int(k) for k in rng.permutation(len(ROUND))]
-    return found[:count]
+    seeds: list[int] = []
+    while len(seeds) < count:
+        cycle = int(rng.integers(10**9))
+        seeds += [FIRST_SEALED_SEED + cycle * len(FAMILY_CYCLE) + int(k) for k in rng.permutation(len(FAMILY_CYCLE))]
+    return seeds[:count]
 
 
-def _plans(size: Size, rng: np.random.Generator) -> tuple[Plan, ...]:
-    return size.table if rng.random() < 0.5 else size.free
+def _draw_motions(size: CaseSize, rng: np.random.Generator) -> tuple[MotionPlan, ...]:
+    return size.table if rng.random() < 0.5 else size.hanging
 
 
-def _like_others(plans: tuple[Plan, ...], seed: int, size: Size) -> tuple[Plan, ...]:
-    """Of the usual motions on a table some for others, which would else tell of friction or creases."""
+def _with_decoy_motions(motions: tuple[MotionPlan, ...], seed: int, size: CaseSize) -> tuple[MotionPlan, ...]:
+    """Replace some of the usual motions on a table by motions that reveal friction or creases."""
     rng = np.random.default_rng([seed, 23])
-    if size != REDUCED or plans != size.table or rng.random() > LIKE_OTHERS:
-        return plans
-    others = (DRAGGED, FOLDED)[int(rng.integers(2))]
-    return (*plans[: len(plans) - len(others)], *others)
+    if size != ROUND_SIZE or motions != size.table or rng.random() > DECOY_MOTION_FRACTION:
+        return motions
+    decoys = (DRAG_MOTIONS, FOLD_MOTIONS)[int(rng.integers(2))]
+    return (*motions[: len(motions) - len(decoys)], *decoys)
 
 
-def _start(seed: int, plan: Plan) -> tuple[float, float]:
-    """Where a sheet is put down: equal places in all episodes would show whatever is off by a millimetre."""
-    x, y = np.random.default_rng([seed, 21, zlib.crc32(repr(plan).encode())]).uniform(-START, START, 2)
+def _draw_placement(seed: int, motion: MotionPlan) -> tuple[float, float]:
+    """Return where a sheet is put down: equal places in all episodes would reveal an offset of a millimetre."""
+    rng = np.random.default_rng([seed, 21, zlib.crc32(repr(motion).encode())])
+    x, y = rng.uniform(-PLACEMENT_RANGE_M, PLACEMENT_RANGE_M, 2)
     return float(x), float(y)
 
 
-def _camera(seed: int) -> dict[str, Any]:
-    """A case's rig: where all cameras stand alike, a false pose can be read off."""
+def _draw_camera(seed: int) -> dict[str, Any]:
+    """Return the camera of a case: if all cameras stood at one place, a false pose could be read off."""
     rng = np.random.default_rng([seed, 19])
-    eye, target = (tuple((np.array(p) + CAMERA * rng.standard_normal(3)).tolist()) for p in (EYE, TARGET))
-    return {"eye": eye, "target": target, "roll": float(ROLL * rng.standard_normal())}
+    eye, target = (
+        tuple((np.array(p) + CAMERA_POSITION_STD_M * rng.standard_normal(3)).tolist()) for p in (EYE_M, TARGET_M)
+    )
+    return {"eye": eye, "target": target, "roll": float(CAMERA_ROLL_STD_RAD * rng.standard_normal())}
 
 
-def _where(size: Size, rng: np.random.Generator, *names: str) -> tuple[Plan, ...]:
-    """Motions in which the effects show."""
-    partners = [(SINGLES | OUTSIDE)[name] for name in names]
-    special = tuple(dict.fromkeys(plan for p in partners for plan in p.shown))
-    plans = size.table if any(p.table for p in partners) else _plans(size, rng)
-    return (*plans[: len(plans) - len(special)], *special)
+def _motions_that_show(size: CaseSize, rng: np.random.Generator, *names: str) -> tuple[MotionPlan, ...]:
+    """Return motions in which the effects are visible."""
+    mappings = [(SINGLE_EFFECTS | OUTSIDE_EFFECTS)[name] for name in names]
+    special = tuple(dict.fromkeys(motion for m in mappings for motion in m.required_motions))
+    motions = size.table if any(m.needs_table for m in mappings) else _draw_motions(size, rng)
+    return (*motions[: len(motions) - len(special)], *special)
 
 
-def _take(plan: Plan, regrasp: float, rng: np.random.Generator) -> Take:
-    """A person repeats no motion exactly."""
-    motion, heading, speed = plan
-    heading, speed = heading + rng.uniform(-8, 8), speed * rng.uniform(0.95, 1.05)
+def _draw_episode(motion: MotionPlan, regrasp: float, rng: np.random.Generator) -> EpisodePlan:
+    """Return an episode of a motion, which a person does not repeat exactly."""
+    name, heading, speed = motion
+    heading, speed = heading + rng.uniform(-HEADING_RANGE_DEG, HEADING_RANGE_DEG), speed * rng.uniform(*SPEED_RANGE)
     shift = rng.uniform(-regrasp, regrasp)
-    # the whole sheet lies further along its own width than the robot says
-    own = (Hidden("robot.base", shift, {"heading": heading + 90.0}),) if regrasp else ()
-    return Take(motion, float(heading), float(speed), own)
+    # the whole sheet lies further along its own width than the robot reports
+    effects = (HiddenEffect("robot.base", shift, {"heading": heading + 90.0}),) if regrasp else ()
+    return EpisodePlan(name, float(heading), float(speed), effects)
 
 
-def _balanced(takes: tuple[Take, ...], regrasp: float) -> tuple[Take, ...]:
-    """Shifts that cancel among episodes of one heading: what all share would be a robot or a camera that is off."""
-    alike = np.array([round(take.heading / 90) for take in takes])
-    shifts = np.array([take.own[0].amplitude if take.own else 0.0 for take in takes])
-    for heading in set(alike.tolist()):
-        shifts[alike == heading] -= shifts[alike == heading].mean()
+def _balance_regrasps(episodes: tuple[EpisodePlan, ...], regrasp: float) -> tuple[EpisodePlan, ...]:
+    """Make the shifts of episodes of one heading cancel: a common shift would be an offset of robot or camera."""
+    quadrant = np.array([round(episode.heading / 90) for episode in episodes])
+    shifts = np.array([episode.effects[0].amplitude if episode.effects else 0.0 for episode in episodes])
+    for heading in set(quadrant.tolist()):
+        shifts[quadrant == heading] -= shifts[quadrant == heading].mean()
     shifts *= min(1.0, regrasp / max(np.abs(shifts).max(), 1e-12))
     return tuple(
-        replace(take, own=tuple(replace(own, amplitude=float(shift)) for own in take.own))
-        for take, shift in zip(takes, shifts, strict=True)
+        replace(episode, effects=tuple(replace(effect, amplitude=float(shift)) for effect in episode.effects))
+        for episode, shift in zip(episodes, shifts, strict=True)
     )
 
 
-def _fabric(rng: np.random.Generator) -> dict[str, float]:
-    """Near the generator's: a sheet that is lighter and stiffer wrinkles at the size of any mesh."""
+def _draw_fabric(rng: np.random.Generator) -> dict[str, float]:
+    """Return a fabric near the engine's default: a lighter, stiffer sheet wrinkles at the size of any mesh."""
     return {
         "areal_density": 0.25 * float(np.exp(0.1 * rng.standard_normal())),
         "membrane_stiffness": 120.0 * float(np.exp(0.15 * rng.standard_normal())),
@@ -236,96 +283,107 @@ def _fabric(rng: np.random.Generator) -> dict[str, float]:
     }
 
 
-def _sheet(rng: np.random.Generator, spread: float) -> dict[str, float]:
-    """The data sheet's values over the true ones; it was weighed to 2 %."""
-    factors = {name: float(np.exp(spread * rng.standard_normal())) for name in STIFFNESSES}
-    return {**factors, "areal_density": float(np.clip(1 + 0.02 * rng.standard_normal(), 0.96, 1.04))}
+def _draw_data_sheet_ratio(rng: np.random.Generator, log_std: float) -> dict[str, float]:
+    """Return the data sheet's values over the true ones; the fabric was weighed to 2 %."""
+    ratios = {name: float(np.exp(log_std * rng.standard_normal())) for name in FABRIC_STIFFNESSES}
+    return {**ratios, "areal_density": float(np.clip(1 + 0.02 * rng.standard_normal(), 0.96, 1.04))}
 
 
-STIFFNESSES = ("membrane_stiffness", "bending_stiffness")
-
-
-def _hide(
+def _draw_effect(
     name: str,
-    share: float,
+    typical_fraction: float,
     rng: np.random.Generator,
-    partners: dict[str, Partner],
-    headings: tuple[float, ...] = (0.0, 90.0, 180.0, 270.0),
-) -> tuple[Hidden, ...]:
-    """An effect at a share of its typical amplitude, and what it needs to be felt."""
-    own = partners[name]
-    typical = CATALOGUE[name].typical if own.typical is None else own.typical
-    options = {"heading": float(rng.choice(headings))} if own.headed else {}
-    amplitude = share * typical * int(rng.choice(own.signs))
-    return (*(Hidden(n, a) for n, a in own.beside), Hidden(name, amplitude, options, share))
+    mappings: dict[str, EffectMapping],
+    headings: tuple[float, ...] = HEADINGS_DEG,
+) -> tuple[HiddenEffect, ...]:
+    """Return an effect at a fraction of its typical amplitude, after the effects that it needs to have a force."""
+    mapping = mappings[name]
+    typical = CATALOGUE[name].typical if mapping.typical is None else mapping.typical
+    options = {"heading": float(rng.choice(headings))} if mapping.has_heading else {}
+    amplitude = typical_fraction * typical * int(rng.choice(mapping.signs))
+    enabling = (HiddenEffect(other, value) for other, value in mapping.enabling_effects)
+    return (*enabling, HiddenEffect(name, amplitude, options, typical_fraction))
 
 
-def _null(rng, turn, slot, size):
+# Each of the following draws what is special in a case of its family: fields of ``Case``, "motions" and "regrasp".
+
+
+def _draw_null(rng: np.random.Generator, cycle: int, index: int, size: CaseSize) -> Fields:
     exact = {"membrane_stiffness": 1.0, "bending_stiffness": 1.0, "areal_density": 1.0}
-    return {"kind": "matched", "said": exact}
+    return {"kind": "matched", "data_sheet_ratio": exact}
 
 
-def _hard(rng, turn, slot, size):
-    """Everything that may be wrong without being a cause."""
+def _draw_hard_null(rng: np.random.Generator, cycle: int, index: int, size: CaseSize) -> Fields:
+    """Draw everything that may be wrong without being a cause."""
     membrane, bending = np.exp(rng.uniform(np.log([0.4, 0.5]), np.log([2.5, 2.0])))
-    said = _sheet(rng, 0.0) | {"membrane_stiffness": float(membrane), "bending_stiffness": float(bending)}
-    name = str(rng.choice([n for n in SINGLES if not SINGLES[n].beside]))
-    small = _hide(name, float(rng.uniform(0.05, 0.2)), rng, SINGLES)
-    mesh = {"diagonals": str(rng.choice(["alternating", "parallel"]))}
-    trouble = {"bias": 0.7e-3, "occlusion": 0.2, "regrasp": 4e-3}
-    found = {"effects": small, "said": said, "plans": _where(size, rng, name)}
-    return {"kind": f"{name} too small to matter", **found, **mesh, **trouble}
+    stiffness_ratios = {"membrane_stiffness": float(membrane), "bending_stiffness": float(bending)}
+    ratios = _draw_data_sheet_ratio(rng, 0.0) | stiffness_ratios
+    name = str(rng.choice([n for n in SINGLE_EFFECTS if not SINGLE_EFFECTS[n].enabling_effects]))
+    small = _draw_effect(name, float(rng.uniform(0.05, 0.2)), rng, SINGLE_EFFECTS)
+    return {
+        "kind": f"{name} too small to matter",
+        "diagonals": str(rng.choice(["alternating", "parallel"])),
+        "effects": small,
+        "data_sheet_ratio": ratios,
+        "motions": _motions_that_show(size, rng, name),
+        "bias": 0.7e-3,
+        "occlusion": 0.2,
+        "regrasp": 4e-3,
+    }
 
 
-def _single(rng, turn, slot, size):
-    """Twelve numbers in a row of a family run through the amplitudes; effects through the catalogue."""
-    share = (HALF, FULL, MORE)[slot % 3]
-    name = list(SINGLES)[(6 * turn + slot + turn // len(SINGLES)) % len(SINGLES)]
-    return {"kind": f"{share:g}", "effects": _hide(name, share, rng, SINGLES), "plans": _where(size, rng, name)}
+def _draw_single(rng: np.random.Generator, cycle: int, index: int, size: CaseSize) -> Fields:
+    """Draw one effect: twelve cases of the family in a row run through the amplitudes, effects through the map."""
+    fraction = (HALF_SIZE, TYPICAL_SIZE, LARGE_SIZE)[index % 3]
+    name = list(SINGLE_EFFECTS)[(6 * cycle + index + cycle // len(SINGLE_EFFECTS)) % len(SINGLE_EFFECTS)]
+    effects = _draw_effect(name, fraction, rng, SINGLE_EFFECTS)
+    return {"kind": f"{fraction:g}", "effects": effects, "motions": _motions_that_show(size, rng, name)}
 
 
-def _double(rng, turn, slot, size):
-    pair = PAIRS[(2 * turn + slot) % len(PAIRS)]
-    effects = tuple(h for name in pair for h in _hide(name, FULL, rng, SINGLES))
-    return {"kind": "two", "effects": effects, "plans": _where(size, rng, *pair)}
+def _draw_double(rng: np.random.Generator, cycle: int, index: int, size: CaseSize) -> Fields:
+    pair = PAIRED_EFFECTS[(2 * cycle + index) % len(PAIRED_EFFECTS)]
+    effects = tuple(e for name in pair for e in _draw_effect(name, TYPICAL_SIZE, rng, SINGLE_EFFECTS))
+    return {"kind": "two", "effects": effects, "motions": _motions_that_show(size, rng, *pair)}
 
 
-def _confounded(rng, turn, slot, size):
-    kind = CONFOUNDED[(2 * turn + slot) % len(CONFOUNDED)]
-    fast = size == SMALL
+def _draw_confounded(rng: np.random.Generator, cycle: int, index: int, size: CaseSize) -> Fields:
+    kind = CONFOUNDED_KINDS[(2 * cycle + index) % len(CONFOUNDED_KINDS)]
     if kind == "tilt or wind":
-        found = _hanging(rng)
+        fields = _draw_tilt_or_wind(rng)
     elif kind == "base or extrinsic":
         name = str(rng.choice(["robot.base", "obs.extrinsic"]))
-        found = {"effects": _hide(name, MORE, rng, SINGLES), "plans": size.free}
+        fields = {"effects": _draw_effect(name, LARGE_SIZE, rng, SINGLE_EFFECTS), "motions": size.hanging}
     elif kind == "mass without forces":
-        found = {"effects": _hide("mass.density", MORE, rng, SINGLES), "plans": size.free, "forces": False}
-    else:  # one speed: what grows with it and what grows with its square look alike
+        effects = _draw_effect("mass.density", LARGE_SIZE, rng, SINGLE_EFFECTS)
+        fields = {"effects": effects, "motions": size.hanging, "has_forces": False}
+    else:  # at one speed, linear and quadratic drag are confounded
         name = str(rng.choice(["air.linear", "air.drag_n"]))
-        same = (("swing", 0.0, 1.8), ("swing-fast", 0.0, 0.5), ("swing", 0.0, 1.8))
-        found = {"effects": _hide(name, HALF, rng, SINGLES), "plans": same[: 2 if fast else 3]}
-    return {"kind": kind, **found}
+        motions = (("swing", 0.0, 1.8), ("swing-fast", 0.0, 0.5), ("swing", 0.0, 1.8))
+        count = 2 if size == FAST_SIZE else 3
+        fields = {"effects": _draw_effect(name, HALF_SIZE, rng, SINGLE_EFFECTS), "motions": motions[:count]}
+    return {"kind": kind, **fields}
 
 
-def _outside(rng, turn, slot, size):
-    name = list(OUTSIDE)[(2 * turn + slot) % len(OUTSIDE)]
-    share = FULL if rng.random() < 0.5 else MORE
-    along = (0.0, 180.0)  # a jet along y would pass beside the sheets, which hang half a metre out along x
-    return {"kind": f"{share:g}", "effects": _hide(name, share, rng, OUTSIDE, along), "plans": _where(size, rng, name)}
+def _draw_outside(rng: np.random.Generator, cycle: int, index: int, size: CaseSize) -> Fields:
+    name = list(OUTSIDE_EFFECTS)[(2 * cycle + index) % len(OUTSIDE_EFFECTS)]
+    fraction = TYPICAL_SIZE if rng.random() < 0.5 else LARGE_SIZE
+    headings = (0.0, 180.0)  # a jet along y would miss the sheets, which hang half a metre out along x
+    effects = _draw_effect(name, fraction, rng, OUTSIDE_EFFECTS, headings)
+    return {"kind": f"{fraction:g}", "effects": effects, "motions": _motions_that_show(size, rng, name)}
 
 
-def _fault(rng, turn, slot, size):
-    kind = FAULTS[turn % len(FAULTS)]
+def _draw_fault(rng: np.random.Generator, cycle: int, index: int, size: CaseSize) -> Fields:
+    kind = FAULT_KINDS[cycle % len(FAULT_KINDS)]
     return {"kind": kind, "fault": kind}
 
 
-def _next(rng, turn, slot, size):
-    """As confounded; what is proposed is then done."""
-    return {"kind": "tilt or wind", **_hanging(rng)}
+def _draw_next_experiment(rng: np.random.Generator, cycle: int, index: int, size: CaseSize) -> Fields:
+    """Draw a confounded case; the experiment that the answer proposes is then carried out."""
+    return {"kind": "tilt or wind", **_draw_tilt_or_wind(rng)}
 
 
-def _hanging(rng):
-    """Across a sheet that hangs still, wind pushes as gravity does that leans."""
+def _draw_tilt_or_wind(rng: np.random.Generator) -> Fields:
+    """Draw wind or tilted gravity, which are confounded across a sheet that hangs still."""
     name = str(rng.choice(["env.gravity_tilt", "air.wind"]))
-    still = (("hang", 0.0, 1.0), ("drape", 0.0, 1.0), ("hang", 0.0, 1.4))
-    return {"effects": _hide(name, MORE, rng, SINGLES, (0.0, 180.0)), "plans": still}
+    motions = (("hang", 0.0, 1.0), ("drape", 0.0, 1.0), ("hang", 0.0, 1.4))
+    return {"effects": _draw_effect(name, LARGE_SIZE, rng, SINGLE_EFFECTS, (0.0, 180.0)), "motions": motions}

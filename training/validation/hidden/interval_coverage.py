@@ -1,6 +1,9 @@
-"""Coverage of the intervals of archived answers, as they are and with a share of the number in quadrature.
+"""Print how often the intervals of archived answers contain the truth, with and without a common error.
 
-python -m torchcloth.training.validation.hidden.interval_coverage docs/hidden/rounds/*.xz     # archives, or folders of `studies hidden`
+    python -m torchcloth.training.validation.hidden.interval_coverage docs/validation/blind-rounds/answers/*.xz
+
+A common error is a fraction of each value that is added to its standard error in quadrature. Arguments are archives, or
+folders of ``studies hidden``.
 """
 
 from __future__ import annotations
@@ -13,45 +16,46 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
+from torchcloth._utils.constants import Z_95
 from torchcloth.errors import InvalidInput
 from torchcloth.training.studies import hidden_scores as scores
 from torchcloth.training.studies.hidden_archive import read_round
 
-from .effect_map import NUMBERS
+from .effect_map import FITTED_FABRIC_VALUES
 
-SHARES = (0.0, 0.02, 0.03, 0.04)  # of the number, standard deviations
-THICK = 1e-3  # m, of all sheets
-NORMAL = 1.96
+COMMON_ERROR_FRACTIONS = (0.0, 0.02, 0.03, 0.04)  # of the value, standard deviations
+SHEET_THICKNESS_M = 1e-3  # of all sheets
 
 
-def apart(answer: dict[str, Any], ends: Sequence[float], number: float) -> float:
-    """The standard error without the share that answers have had since they have one."""
+def std_without_common_error(answer: dict[str, Any], ends: Sequence[float], value: float) -> float:
+    """Return the standard error of an interval, less the common error that newer answers include."""
     low, high = ends
-    return max(((high - low) / (2 * NORMAL)) ** 2 - (answer.get("common_error", 0.0) * number) ** 2, 0.0) ** 0.5
+    variance = ((high - low) / (2 * Z_95)) ** 2 - (answer.get("common_error", 0.0) * value) ** 2
+    return max(variance, 0.0) ** 0.5
 
 
-def amplitudes(truth: dict[str, Any], answer: dict[str, Any]) -> Iterator[tuple[str, float, float]]:
-    """("amplitude", error, standard error) of each that is named outright, over what is hidden."""
+def amplitude_errors(truth: dict[str, Any], answer: dict[str, Any]) -> Iterator[tuple[str, float, float]]:
+    """Yield ("amplitudes", relative error, its standard error) of each effect that is named outright."""
     asked = scores.wanted(truth)
     for cause, wanted in zip(scores._matched(scores.named(answer), asked), asked, strict=True):
         if cause is not None and cause.best in wanted.names and wanted.comparable:
-            std = apart(answer, cause.ci95, cause.amplitude) / abs(wanted.amplitude)
+            std = std_without_common_error(answer, cause.ci95, cause.amplitude) / abs(wanted.amplitude)
             yield "amplitudes", cause.amplitude / wanted.amplitude - 1, std
 
 
-def numbers(truth: dict[str, Any], answer: dict[str, Any]) -> Iterator[tuple[str, float, float]]:
-    """(name, error of the logarithm, standard error) of the fabric's numbers, of a null."""
+def fabric_errors(truth: dict[str, Any], answer: dict[str, Any]) -> Iterator[tuple[str, float, float]]:
+    """Yield (name, error of the logarithm, its standard error) of the fabric's fitted values in null cases."""
     if truth["family"] not in scores.NULLS:
         return
-    for name, own in NUMBERS.items():
+    for name, fabric_name in FITTED_FABRIC_VALUES.items():
         if (row := answer.get("parameters", {}).get(name)) is not None:
-            true = truth["fabric"][own] / (THICK if name == "youngs_modulus" else 1.0)
-            ends = [math.log(end) for end in row["ci95"]]
-            yield f"{name} of nulls", math.log(row["value"] / true), apart(answer, ends, 1.0)
+            true = truth["fabric"][fabric_name] / (SHEET_THICKNESS_M if name == "youngs_modulus" else 1.0)
+            log_ends = [math.log(end) for end in row["ci95"]]
+            yield f"{name} of nulls", math.log(row["value"] / true), std_without_common_error(answer, log_ends, 1.0)
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Command line."""
+    """Run the command line and return the exit code."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("rounds", nargs="+", type=Path, metavar="ROUND")
     rows: dict[str, list[tuple[float, float]]] = defaultdict(list)
@@ -61,18 +65,22 @@ def main(arguments: list[str] | None = None) -> int:
         print(error, file=sys.stderr)
         return 2
     for case in cases:
-        for errors_of in (amplitudes, numbers):
+        for errors_of in (amplitude_errors, fabric_errors):
             for name, error, std in errors_of(case["truth"], case["answer"]):
                 rows[name].append((error, std))
     if not rows:
         print("these rounds have no answer that can be compared", file=sys.stderr)
         return 2
-    print("| of | number | mean error |" + "".join(f" held, with {100 * s:.0f} % |" for s in SHARES))
-    print("| --- |" + " --- |" * (2 + len(SHARES)))
-    for name, each in rows.items():
-        held = [sum(abs(e) < NORMAL * math.hypot(s, share) for e, s in each) / len(each) for share in SHARES]
-        mean = sum(e for e, _ in each) / len(each)
-        print(f"| {name} | {len(each)} | {100 * mean:+.1f} % |" + "".join(f" {100 * h:.0f} % |" for h in held))
+    headings = "".join(f" covered, common error {100 * f:.0f} % |" for f in COMMON_ERROR_FRACTIONS)
+    print("| value | number | mean error |" + headings)
+    print("| --- |" + " --- |" * (2 + len(COMMON_ERROR_FRACTIONS)))
+    for name, pairs in rows.items():
+        covered = [
+            sum(abs(e) < Z_95 * math.hypot(s, fraction) for e, s in pairs) / len(pairs)
+            for fraction in COMMON_ERROR_FRACTIONS
+        ]
+        mean = sum(e for e, _ in pairs) / len(pairs)
+        print(f"| {name} | {len(pairs)} | {100 * mean:+.1f} % |" + "".join(f" {100 * c:.0f} % |" for c in covered))
     return 0
 
 

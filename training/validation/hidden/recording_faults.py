@@ -1,4 +1,4 @@
-"""What goes wrong in a recording itself: each takes a recording and returns the one that was written instead."""
+"""Faults of a recording itself. Each function takes a recording and returns the faulty one that is written instead."""
 
 from __future__ import annotations
 
@@ -9,40 +9,41 @@ import numpy as np
 
 from torchcloth.recordings import Recording
 
-JUMPS = (0.1, 0.6)  # s
-UNITS = (0.25, 4.0)  # depth units of 1 mm read as units of 0.25 mm, and the other way round
+CLOCK_JUMP_RANGE_S = (0.1, 0.6)
+WRONG_UNIT_FACTORS = (0.25, 4.0)  # depths of 1 mm units read as 0.25 mm units, and the reverse
 
 
-def clock_jump(recording: Recording, rng: np.random.Generator) -> Recording:
-    """The camera's clock jumps ahead half-way."""
+def make_clock_jump(recording: Recording, rng: np.random.Generator) -> Recording:
+    """Let the camera's clock jump ahead half-way."""
     points = recording.require("points")
-    late = np.where(np.arange(len(points.t)) >= len(points.t) // 2, rng.uniform(*JUMPS), 0.0)
-    return replace(recording, points=replace(points, t=points.t + late))
+    is_second_half = np.arange(len(points.t)) >= len(points.t) // 2
+    delay = np.where(is_second_half, rng.uniform(*CLOCK_JUMP_RANGE_S), 0.0)
+    return replace(recording, points=replace(points, t=points.t + delay))
 
 
-def swapped_grippers(recording: Recording, rng: np.random.Generator) -> Recording:
-    """Each gripper is said to hold what the other holds."""
-    (one, held), (other, also) = recording.grasps.items()
-    return replace(recording, grasps={one: also, other: held})
+def swap_grippers(recording: Recording, rng: np.random.Generator) -> Recording:
+    """Exchange what the two grippers hold."""
+    (first, first_grasp), (second, second_grasp) = recording.grasps.items()
+    return replace(recording, grasps={first: second_grasp, second: first_grasp})
 
 
-def wrong_unit(recording: Recording, rng: np.random.Generator) -> Recording:
-    """Depths in another unit than is said."""
+def scale_depths(recording: Recording, rng: np.random.Generator) -> Recording:
+    """Read depths in a wrong unit."""
     points = recording.require("points")
     eye = recording.cameras["cam0"].T_world_camera[:3, 3]
-    return replace(recording, points=replace(points, xyz=eye + rng.choice(UNITS) * (points.xyz - eye)))
+    return replace(recording, points=replace(points, xyz=eye + rng.choice(WRONG_UNIT_FACTORS) * (points.xyz - eye)))
 
 
-def mirrored(recording: Recording, rng: np.random.Generator) -> Recording:
-    """A left-handed world."""
+def mirror_points(recording: Recording, rng: np.random.Generator) -> Recording:
+    """Write points in a left-handed world."""
     points = recording.require("points")
     return replace(recording, points=replace(points, xyz=points.xyz * [1.0, -1.0, 1.0]))
 
 
 FAULTS: dict[str, Callable[[Recording, np.random.Generator], Recording]] = {
     "": lambda recording, rng: recording,
-    "clock jump": clock_jump,
-    "swapped grippers": swapped_grippers,
-    "wrong unit": wrong_unit,
-    "mirrored": mirrored,
+    "clock jump": make_clock_jump,
+    "swapped grippers": swap_grippers,
+    "wrong unit": scale_depths,
+    "mirrored": mirror_points,
 }

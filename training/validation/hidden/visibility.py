@@ -1,9 +1,9 @@
-"""Says by how much a case's effects move its cloth beside what the fabric's numbers could do; after the answer, too.
+"""Print how visible the effects of a hidden case are: how far they move the cloth that no fabric parameter does.
 
-python -m torchcloth.training.validation.hidden.visibility --seed 12
+    python -m torchcloth.training.validation.hidden.visibility --seed 12    # after the answer is written
 
-By the truth's engine alone, without noise, on a coarser mesh: it knows nothing of how a diagnosis goes about it. What
-the sensor sees otherwise, or a robot that stands elsewhere, moves no cloth and is left out.
+It uses the independent engine alone, without noise, on a coarser mesh, and knows nothing of the diagnosis. Errors of
+the sensor and of a robot's base move no cloth and are left out.
 """
 
 from __future__ import annotations
@@ -15,78 +15,105 @@ import numpy as np
 
 from torchcloth.errors import InvalidInput
 
-from ..independent.flex_sheet import grid
-from ..independent.motions import motion
-from ..independent.scene import evenly, simulate
-from .case_command import told
+from ..independent.flex_sheet import sheet_mesh
+from ..independent.motions import make_motion
+from ..independent.scene import resample_evenly, simulate
+from .case_command import print_case_json
 from .case_sampling import Case
-from .effect_map import OUTSIDE, SINGLES
-from .make_case import scenes
+from .effect_map import OUTSIDE_EFFECTS, SINGLE_EFFECTS
+from .make_case import make_scenes
 
 Array = np.ndarray
-PATCHES, WINDOW = 4, 0.2  # along either side of the sheet; s: a diagnosis sees means over such
-SEEN, FELT = 0.5e-3, 10e-3  # m and N, how exactly such a mean is known, about
-FABRIC = {"membrane_stiffness": (0.1, 0.9), "bending_stiffness": (0.2, 0.9), "areal_density": (0.04, 0.02)}
-"""Step of the logarithm and standard deviation of what a data sheet says of it."""
-UNMOVED = ("obs.", "robot.base")
+PATCHES_PER_SIDE, WINDOW_S = 4, 0.2  # a diagnosis uses means over such patches and windows
+MEAN_POSITION_STD_M, MEAN_FORCE_STD_N = 0.5e-3, 10e-3  # about how exactly such a mean is known
+# step of the logarithm, and standard deviation of the logarithm that a data sheet leaves open
+FABRIC_STEP_AND_STD = {
+    "membrane_stiffness": (0.1, 0.9),
+    "bending_stiffness": (0.2, 0.9),
+    "areal_density": (0.04, 0.02),
+}
+IMMOBILE_PREFIXES = ("obs.", "robot.base")  # of effects that move no cloth
 
 
-def shown(found: Case) -> list[dict[str, object]]:
-    """For each effect that moves the cloth, RMS of the means' changes: positions [m], forces [N].
+def measure_visibility(case: Case) -> list[dict[str, object]]:
+    """Return for each effect that moves the cloth how far it changes the means.
 
-    ``moves`` and ``pulls``: altogether. ``left_moves`` and ``left_pulls``: what no membrane stiffness, bending
-    stiffness or areal density does, as far as a data sheet leaves them open.
+    ``displacement_rms_m`` and ``force_rms_n`` are the whole change. ``unexplained_displacement_rms_m`` and
+    ``unexplained_force_rms_n`` are what no membrane stiffness, bending stiffness or areal density can do, as far as a
+    data sheet leaves these open.
     """
-    found = replace(found, nodes=found.size.fit)
-    effects = [e for e in found.effects if e.name in SINGLES | OUTSIDE and not e.name.startswith(UNMOVED)]
+    case = replace(case, nodes=case.size.fit_nodes)
+    mapped = SINGLE_EFFECTS | OUTSIDE_EFFECTS
+    effects = [e for e in case.effects if e.name in mapped and not e.name.startswith(IMMOBILE_PREFIXES)]
     if not effects:
         return []
-    whole = means(found)
-    slope = lambda name, h: (means(found, name, h) - means(found, name, -h)) / (2 * h)  # noqa: E731
-    slopes = np.stack([slope(name, step) for name, (step, _) in FABRIC.items()], -1)
-    known = np.diag([1 / std for _, std in FABRIC.values()])
-    out: list[dict[str, object]] = []
+    means = simulate_means(case)
+    slopes = np.stack([_central_difference(case, name, step) for name, (step, _) in FABRIC_STEP_AND_STD.items()], -1)
+    prior = np.diag([1 / std for _, std in FABRIC_STEP_AND_STD.values()])
+    rows: list[dict[str, object]] = []
     for effect in effects:
-        others = replace(found, effects=tuple(e for e in found.effects if e is not effect))
+        others = replace(case, effects=tuple(e for e in case.effects if e is not effect))
         try:
-            done = whole - means(others)
+            change = means - simulate_means(others)
         except InvalidInput:  # another effect needs this one, and stands for both
             continue
-        fitted, *_ = np.linalg.lstsq(np.vstack([slopes, known]), np.append(done, np.zeros(len(known))), rcond=None)
-        (moves, pulls), (left, pull) = rms(found, done), rms(found, done - slopes @ fitted)
-        out.append({"name": effect.name, "moves": moves, "pulls": pulls, "left_moves": left, "left_pulls": pull})
-    return out
+        target = np.append(change, np.zeros(len(prior)))
+        fitted, *_ = np.linalg.lstsq(np.vstack([slopes, prior]), target, rcond=None)
+        (displacement, force), (left, left_force) = rms(case, change), rms(case, change - slopes @ fitted)
+        rows.append(
+            {
+                "name": effect.name,
+                "displacement_rms_m": displacement,
+                "force_rms_n": force,
+                "unexplained_displacement_rms_m": left,
+                "unexplained_force_rms_n": left_force,
+            }
+        )
+    return rows
 
 
-def means(found: Case, name: str = "", change: float = 0.0) -> Array:
-    """Mean positions by patch and window, then mean forces by window, of all episodes, in units of what is known.
+def _central_difference(case: Case, name: str, step: float) -> Array:
+    return (simulate_means(case, name, step) - simulate_means(case, name, -step)) / (2 * step)
 
-    With one number of the fabric changed, by its logarithm.
+
+def simulate_means(case: Case, name: str = "", log_change: float = 0.0) -> Array:
+    """Return the means of all episodes, in units of their standard deviations.
+
+    Mean positions by patch and window come first, then mean forces by window.
+
+    Args:
+        case: its truth is simulated.
+        name: value of the fabric that is changed; "": none.
+        log_change: of the logarithm of that value.
     """
     if name:
-        found = replace(found, fabric=found.fabric | {name: found.fabric[name] * np.exp(change)})
-    places, forces = [], []
-    for take in found.takes:
-        scene, _ = scenes(found, take)
-        moved = motion(take.motion, scene.sheet, take.heading, take.speed, take.start)
-        result = simulate(scene, moved)
-        x = evenly(scene, result.x)
-        uv = grid(scene.sheet)[0] / [scene.sheet.width, scene.sheet.height]
-        patch = np.minimum((uv * PATCHES).astype(int), PATCHES - 1) @ [PATCHES, 1]
-        window = (moved.t / WINDOW).astype(int)
+        case = replace(case, fabric=case.fabric | {name: case.fabric[name] * np.exp(log_change)})
+    positions, forces = [], []
+    for episode in case.episodes:
+        scene, _ = make_scenes(case, episode)
+        motion = make_motion(episode.motion, scene.sheet, episode.heading, episode.speed, episode.start)
+        result = simulate(scene, motion)
+        x = resample_evenly(scene, result.x)
+        uv = sheet_mesh(scene.sheet)[0] / [scene.sheet.width, scene.sheet.height]
+        patch = np.minimum((uv * PATCHES_PER_SIDE).astype(int), PATCHES_PER_SIDE - 1) @ [PATCHES_PER_SIDE, 1]
+        window = (motion.t / WINDOW_S).astype(int)
         for k in range(window[-1] + 1):
-            now = x[window == k].mean(0)
-            places += [now[patch == p].mean(0) for p in range(PATCHES**2)]
+            mean = x[window == k].mean(0)
+            positions += [mean[patch == p].mean(0) for p in range(PATCHES_PER_SIDE**2)]
             forces += [force[window == k].mean(0) for force in result.force.values()]
-    return np.concatenate([np.concatenate(places) / SEEN, np.concatenate(forces) / FELT * found.forces])
+    scaled_forces = np.concatenate(forces) / MEAN_FORCE_STD_N * case.has_forces
+    return np.concatenate([np.concatenate(positions) / MEAN_POSITION_STD_M, scaled_forces])
 
 
-def rms(found: Case, change: Array) -> tuple[float, float]:
-    """(m, N) per axis of what ``means`` gave."""
-    of_forces = change.size * 2 // (PATCHES**2 + 2)  # two grippers beside each window's patches
-    places, forces = np.split(change, [change.size - of_forces])
-    return float(SEEN * np.sqrt(np.mean(places**2))), float(FELT * np.sqrt(np.mean(forces**2)))
+def rms(case: Case, change: Array) -> tuple[float, float]:
+    """Return the root mean square per axis of a change of the means: positions [m] and forces [N]."""
+    force_count = change.size * 2 // (PATCHES_PER_SIDE**2 + 2)  # two grippers beside each window's patches
+    positions, forces = np.split(change, [change.size - force_count])
+    return (
+        float(MEAN_POSITION_STD_M * np.sqrt(np.mean(positions**2))),
+        float(MEAN_FORCE_STD_N * np.sqrt(np.mean(forces**2))),
+    )
 
 
 if __name__ == "__main__":
-    sys.exit(told(__doc__, shown))
+    sys.exit(print_case_json(__doc__, measure_visibility))

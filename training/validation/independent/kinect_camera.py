@@ -1,4 +1,4 @@
-"""What a simulated Azure Kinect sees of the cloth, with the arms in its way."""
+"""Point clouds of a simulated Azure Kinect, with the arms as occluders."""
 
 from __future__ import annotations
 
@@ -14,20 +14,21 @@ from torchcloth.robots import Scene
 
 Array = np.ndarray
 Mesh = tuple[Array, Array]
-K = np.array([[503.8, 0.0, 321.5], [0.0, 503.8, 329.0], [0.0, 0.0, 1.0]])  # of the rectified image
+RECTIFIED_INTRINSICS_PX = np.array([[503.8, 0.0, 321.5], [0.0, 503.8, 329.0], [0.0, 0.0, 1.0]])
 
 
 @dataclass(frozen=True)
-class Place:
-    """The camera's place and how its images become points.
+class CameraPlacement:
+    """Pose of the camera, and how its images become points.
 
     Attributes:
-        target: [3] m, where it looks.
-        distance: m, from there.
-        azimuth, elevation: rad, off the normal of the hanging cloth (+x): sideways, upwards.
+        target: [3] m, the point at which it looks.
+        distance: m, from the target.
+        azimuth: rad, sideways off the normal of the hanging cloth (+x).
+        elevation: rad, upwards off that normal.
         noise: of the depth.
-        rim: px, taken off the cloth's mask.
-        points: per frame at most.
+        eroded_pixels: width of the rim that is taken off the cloth's mask.
+        max_points: per frame.
     """
 
     target: tuple[float, float, float] = (0.50, 0.0, 0.32)
@@ -35,25 +36,25 @@ class Place:
     azimuth: float = np.deg2rad(28.0)
     elevation: float = np.deg2rad(12.0)
     noise: observe.DepthNoise = field(default_factory=observe.DepthNoise)
-    rim: int = 2
-    points: int = 250
+    eroded_pixels: int = 2
+    max_points: int = 250
 
-    def camera(self) -> observe.DepthCamera:
-        """The camera in its place, its image rectified."""
+    def make_camera(self) -> observe.DepthCamera:
+        """Return the camera in its place, with a rectified image."""
         flat = np.cos(self.elevation)
         away = [flat * np.cos(self.azimuth), flat * np.sin(self.azimuth), np.sin(self.elevation)]
         eye = np.asarray(self.target) + self.distance * np.array(away)
-        return observe.DepthCamera(640, 576, K, observe.look_at(eye, self.target), (0.5, 3.86))
+        return observe.DepthCamera(640, 576, RECTIFIED_INTRINSICS_PX, observe.look_at(eye, self.target), (0.5, 3.86))
 
-    def view(self) -> observe.View:
-        """The camera with its noise."""
-        return observe.View(self.camera(), self.noise, self.rim, self.points)
+    def make_view(self) -> observe.View:
+        """Return the camera with its noise and its processing."""
+        return observe.View(self.make_camera(), self.noise, self.eroded_pixels, self.max_points)
 
 
-def arm_meshes(rig: Scene, q: dict[str, Array]) -> Callable[[int], list[Mesh]]:
-    """The arms' solids at knot k of the joint positions [K, 7], by arm."""
+def arm_mesh_function(rig: Scene, q: dict[str, Array]) -> Callable[[int], list[Mesh]]:
+    """Return a function that gives the arms' meshes at knot k of the joint positions [K, 7] rad, by arm."""
     solids = rig.geometry({name: torch.as_tensor(value) for name, value in q.items()})
-    return lambda k: observe.solid_meshes(solids, at=k)
+    return lambda k: observe.build_solid_meshes(solids, at=k)
 
 
 def observe_cloth(
@@ -64,25 +65,26 @@ def observe_cloth(
     occluders: Callable[[int], list[Mesh]],
     rng: np.random.Generator,
 ) -> tuple[PointClouds, float, Array]:
-    """Points of the cloth in every frame.
+    """Return the points of the cloth in every frame.
 
     Args:
         view: camera and processing.
-        t, x: [T] s and [T, V, 3] m, the true cloth at the frames.
+        t: [T] s, times of the frames.
+        x: [T, V, 3] m, the true cloth at the frames.
         faces: [F, 3].
-        occluders: meshes at frame i.
+        occluders: returns the meshes at frame i.
         rng: source of all noise.
 
     Returns:
-        The points, the standard deviation of their depth in m (mean over all points), and per frame the share [T] of
-        the unhidden cloth's pixels that were kept by the mask.
+        The points, the standard deviation of their depth (mean over all points) [m], and the visible fraction [T]: the
+        mask's pixels over those of the cloth without occluders.
     """
-    clouds, sigma, share = [], [], []
+    clouds, sigma, visible_fraction = [], [], []
     for i in range(len(t)):
-        seen = observe.capture(view, x[i], faces, occluders(i), rng=rng)
-        alone, _ = observe.render_depth(view.camera, [(x[i], faces)])
-        clouds.append(seen.points)
-        sigma.append(view.noise.sigma(view.camera.project(seen.points)[1]).mean())
-        share.append((seen.mask & (seen.depth > 0)).sum() / (alone > 0).sum())
+        capture = observe.capture(view, x[i], faces, occluders(i), rng=rng)
+        unoccluded, _ = observe.render_depth(view.camera, [(x[i], faces)])
+        clouds.append(capture.points)
+        sigma.append(view.noise.sigma(view.camera.project(capture.points)[1]).mean())
+        visible_fraction.append((capture.mask & (capture.depth > 0)).sum() / (unoccluded > 0).sum())
     counts = np.array([len(cloud) for cloud in clouds])
-    return PointClouds(np.asarray(t), np.concatenate(clouds), counts), float(np.mean(sigma)), np.array(share)
+    return PointClouds(np.asarray(t), np.concatenate(clouds), counts), float(np.mean(sigma)), np.array(visible_fraction)

@@ -1,4 +1,4 @@
-"""Where the sheet is heavier than its areal density says, and where down is."""
+"""Masses beyond the sheet's areal density, and the direction of gravity."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from .flex_sheet import SheetSpec, vertex_masses
-from .force_terms import Hook
-from .plate import patch
+from .force_terms import ForceTerm
+from .plate import central_patch
 
 if TYPE_CHECKING:
     from .mujoco_cloth import MujocoCloth
@@ -18,16 +18,17 @@ Array = np.ndarray
 
 
 @dataclass(frozen=True)
-class WeightSpec:
+class MassSpec:
     """Masses beyond the sheet's own, and the direction of gravity.
 
     Attributes:
-        density: -, by which the areal density differs, as a share.
+        density: -, fraction by which the areal density differs.
         hem: kg/m, along all four edges.
         seam: kg/m, along v at half the width.
-        layer: -, a second layer on the middle ninth of the sheet: this many times its own mass more.
-        moisture: 1/s, share of the mass that the cloth gains per second.
-        tilt: rad, by which gravity leans towards ``heading`` degrees (0: +x, 90: +y).
+        layer: -, mass of a second layer on the middle ninth of the sheet, over the sheet's own mass there.
+        moisture: 1/s, fraction of the mass that the cloth gains per second.
+        tilt: rad, by which gravity leans towards ``heading``.
+        heading: degrees (0: +x, 90: +y).
     """
 
     density: float = 0.0
@@ -39,41 +40,43 @@ class WeightSpec:
     heading: float = 0.0
 
 
-def masses(spec: WeightSpec, sheet: SheetSpec, uv: Array) -> Array:
-    """Lumped masses [V] kg at the start."""
-    own = vertex_masses(sheet) * (1 + spec.density) * (1 + spec.layer * patch(sheet, uv))
+def initial_masses(spec: MassSpec, sheet: SheetSpec, uv: Array) -> Array:
+    """Return the lumped masses [V] kg at the start."""
+    mass = vertex_masses(sheet) * (1 + spec.density) * (1 + spec.layer * central_patch(sheet, uv))
     nu, nv = sheet.nodes
-    table = own.reshape(nv, nu)
-    across, down = _lengths(nu, sheet.width), _lengths(nv, sheet.height)
+    table = mass.reshape(nv, nu)
+    lengths_u, lengths_v = _vertex_lengths(nu, sheet.width), _vertex_lengths(nv, sheet.height)
     for row in (0, -1):
-        table[row] += spec.hem * across
-        table[:, row] += spec.hem * down
-    table[:, nu // 2] += spec.seam * down
-    return own
+        table[row] += spec.hem * lengths_u
+        table[:, row] += spec.hem * lengths_v
+    table[:, nu // 2] += spec.seam * lengths_v
+    return mass
 
 
-def _lengths(n: int, length: float) -> Array:
+def _vertex_lengths(n: int, length: float) -> Array:
     out = np.full(n, length / (n - 1))
     out[[0, -1]] /= 2
     return out
 
 
-class Weight(Hook):
-    """Sets the masses, lets them drift, and turns gravity."""
+class MassDistribution(ForceTerm):
+    """Sets the vertices' masses, lets them drift, and tilts gravity."""
 
-    def __init__(self, spec: WeightSpec) -> None:
+    def __init__(self, spec: MassSpec) -> None:
         self.spec = spec
 
-    def start(self, cloth: MujocoCloth, x: Array) -> None:
-        self.cloth, self.first = cloth, masses(self.spec, cloth.spec, cloth.uv)
-        cloth.weigh(self.first.copy())
+    def reset(self, cloth: MujocoCloth, x: Array) -> None:
+        """Give the cloth its initial masses."""
+        self.cloth, self.initial = cloth, initial_masses(self.spec, cloth.spec, cloth.uv)
+        cloth.set_masses(self.initial.copy())
         g, angle, heading = cloth.spec.gravity, self.spec.tilt, np.deg2rad(self.spec.heading)
         side = -g * np.sin(angle)
-        self.turned = np.array([side * np.cos(heading), side * np.sin(heading), g * (np.cos(angle) - 1)])
-        self.since = None
+        self.added_gravity = np.array([side * np.cos(heading), side * np.sin(heading), g * (np.cos(angle) - 1)])
+        self.start_time = None
 
     def force(self, t: float, x: Array, v: Array) -> Array:
-        self.since = t if self.since is None else self.since
+        """Return the force [V, 3] N of tilted gravity, and update the masses."""
+        self.start_time = t if self.start_time is None else self.start_time
         if self.spec.moisture:
-            self.cloth.weigh(self.first * (1 + self.spec.moisture * (t - self.since)))
-        return self.cloth.mass[:, None] * self.turned
+            self.cloth.set_masses(self.initial * (1 + self.spec.moisture * (t - self.start_time)))
+        return self.cloth.mass[:, None] * self.added_gravity

@@ -1,6 +1,6 @@
-"""What real fabric's membrane has beyond MuJoCo's isotropic one: stresses added to it, on the same triangles.
+"""Membrane stresses beyond MuJoCo's isotropic membrane, added on the same triangles.
 
-Second Piola-Kirchhoff stress resultants S [N/m] against the Green strain e, forces - area F S grad N.
+They are second Piola-Kirchhoff stress resultants S [N/m] against the Green strain e; the forces are - area F S grad N.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from .force_terms import Hook, Triangles, dahl
+from .force_terms import ForceTerm, TriangleOperators, advance_dahl_friction
 
 if TYPE_CHECKING:
     from .mujoco_cloth import MujocoCloth
@@ -23,11 +23,12 @@ class MembraneSpec:
     """Deviations from an isotropic Saint Venant-Kirchhoff membrane with viscosity.
 
     Attributes:
-        weft: -, by which Young's modulus along v falls short of that along u, as a share.
-        shear: -, by which the shear modulus differs from the isotropic one, as a share.
+        weft: -, fraction by which Young's modulus along v is below that along u.
+        shear: -, fraction by which the shear modulus differs from the isotropic one.
         stiffening: -, c of T = E e (1 + c e) along u and v, in tension.
-        viscosity: s, tau of the further stress tau E de/dt.
-        friction: N/m, 2HG: full width of the shear loop, built up over ``threshold`` rad.
+        viscosity: s, tau of the added stress tau E de/dt.
+        friction: N/m, 2HG, full width of the shear hysteresis loop.
+        threshold: rad, shear angle over which the friction builds up.
     """
 
     weft: float = 0.0
@@ -38,25 +39,28 @@ class MembraneSpec:
     threshold: float = 0.01
 
 
-class Membrane(Hook):
-    """The added stresses."""
+class Membrane(ForceTerm):
+    """Forces of the added membrane stresses."""
 
     def __init__(self, spec: MembraneSpec) -> None:
         self.spec = spec
-        self.settles = not spec.friction
+        self.acts_while_settling = not spec.friction
 
-    def start(self, cloth: MujocoCloth, x: Array) -> None:
-        self.triangles = Triangles(cloth)
+    def reset(self, cloth: MujocoCloth, x: Array) -> None:
+        """Take the cloth's moduli, and start friction without force at positions x [V, 3] m."""
+        self.triangles = TriangleOperators(cloth)
         self.young, nu = cloth.spec.membrane_stiffness, cloth.spec.poisson_ratio
-        self.c11, self.c12, self.c22 = orthotropic(self.young, nu, 1 - self.spec.weft) - orthotropic(self.young, nu, 1)
+        added = orthotropic_stiffness(self.young, nu, 1 - self.spec.weft) - orthotropic_stiffness(self.young, nu, 1)
+        self.c11, self.c12, self.c22 = added
         self.shear = self.spec.shear * self.young / (2 * (1 + nu))
         self.angle = 2 * self._strain(*self._columns(x))[2]
-        self.share = np.zeros_like(self.angle)
+        self.dahl_state = np.zeros_like(self.angle)
 
     def force(self, t: float, x: Array, v: Array) -> Array:
+        """Return the forces [V, 3] N of the stresses, and advance the friction."""
         fu, fv = self._columns(x)
         strain = self._strain(fu, fv)
-        su, sv, suv = self._elastic(*strain)
+        su, sv, suv = self._elastic_stress(*strain)
         if self.spec.viscosity:
             ru, rv = self._columns(v)
             eta = self.spec.viscosity * self.young
@@ -64,29 +68,33 @@ class Membrane(Hook):
             suv = suv + eta * 0.5 * (_dot(fu, rv) + _dot(fv, ru))
         if self.spec.friction:
             angle = 2 * strain[2]
-            self.share = dahl(self.share, angle - self.angle, self.spec.threshold)
+            self.dahl_state = advance_dahl_friction(self.dahl_state, angle - self.angle, self.spec.threshold)
             self.angle = angle
-            suv = suv + 0.5 * self.spec.friction * self.share  # half the loop's width
+            suv = suv + 0.5 * self.spec.friction * self.dahl_state  # half the loop's width
         su, sv, suv = su[:, None], sv[:, None], suv[:, None]
-        return self.triangles.divergence(fu * su + fv * suv, fu * suv + fv * sv)
+        return self.triangles.nodal_forces(fu * su + fv * suv, fu * suv + fv * sv)
 
-    def _elastic(self, eu: Array, ev: Array, euv: Array) -> tuple[Array, Array, Array]:
-        stiff = self.spec.stiffening * self.young
-        su = self.c11 * eu + self.c12 * ev + stiff * np.maximum(eu, 0) ** 2
-        sv = self.c12 * eu + self.c22 * ev + stiff * np.maximum(ev, 0) ** 2
+    def _elastic_stress(self, eu: Array, ev: Array, euv: Array) -> tuple[Array, Array, Array]:
+        stiffening = self.spec.stiffening * self.young
+        su = self.c11 * eu + self.c12 * ev + stiffening * np.maximum(eu, 0) ** 2
+        sv = self.c12 * eu + self.c22 * ev + stiffening * np.maximum(ev, 0) ** 2
         return su, sv, 2 * self.shear * euv
 
     def _columns(self, field: Array) -> tuple[Array, Array]:
-        return self.triangles.along_u @ field, self.triangles.along_v @ field
+        return self.triangles.derivative_u @ field, self.triangles.derivative_v @ field
 
     @staticmethod
     def _strain(fu: Array, fv: Array) -> tuple[Array, Array, Array]:
         return 0.5 * (_dot(fu, fu) - 1), 0.5 * (_dot(fv, fv) - 1), 0.5 * _dot(fu, fv)
 
 
-def orthotropic(young: float, nu: float, ratio: float) -> Array:
-    """Plane-stress stiffnesses C11, C12, C22 [N/m] of moduli ``young`` along u and ``ratio * young`` along v; ``nu`` is
-    the contraction along v under tension along u.
+def orthotropic_stiffness(young: float, nu: float, ratio: float) -> Array:
+    """Return the plane-stress stiffnesses C11, C12, C22 [N/m] of an orthotropic membrane.
+
+    Args:
+        young: N/m, modulus along u; along v it is ``ratio * young``.
+        nu: -, contraction along v under tension along u.
+        ratio: -, modulus along v over that along u.
     """
     return young / (1 - ratio * nu**2) * np.array([1.0, ratio * nu, ratio])
 
