@@ -29,7 +29,7 @@ test: .venv/.open3d-works lint types  ## install everything for development, the
 test-slow: .venv/.open3d-works  ## the tests that take minutes
 	$(PYTEST) -m "slow and not gpu" $(PYTEST_ARGS)
 
-verify: .venv/.installed-dev  ## physics against closed forms and symmetry, writes docs/verification.md (VERIFY_ARGS=--help)
+verify: .venv/.installed-dev  ## physics against closed forms and symmetry, writes docs/validation/verification.md (VERIFY_ARGS=--help)
 	OMP_NUM_THREADS=1 $(BIN)/python -m torchcloth.training.validation.verification.run $(VERIFY_ARGS)
 
 example: .venv/.open3d-works  ## make the shipped example again (MuJoCo simulates it, minutes)

@@ -51,7 +51,7 @@ def _parse(argv: Sequence[str] | None, cases: Mapping[str, Case]) -> argparse.Na
     parser.add_argument("--list", action="store_true", help="name the cases and stop")
     parser.add_argument("--fast", action="store_true", help="coarser, and without the long cases")
     parser.add_argument("--out", type=Path, default=ROOT / "out/verification", help="results, pictures and page")
-    parser.add_argument("--docs", type=Path, default=ROOT / "docs", help="where a complete run puts the page")
+    parser.add_argument("--docs", type=Path, default=ROOT / "docs/validation", help="where a complete run puts the page")
     again = parser.add_mutually_exclusive_group()
     again.add_argument("--fresh", action="store_true", help="use no finished case of an earlier run")
     again.add_argument(
