@@ -68,11 +68,11 @@ def test_a_sheet_carries_its_first_frame_as_a_grid(assert_same, tmp_path):
     uv = np.random.default_rng(0).uniform(0, [0.3, 0.4], (50, 2))
     uv[:2] = [[0.0, 0.0], [0.3, 0.4]]
     expected = np.stack([uv[:, 0] + 1.0, uv[:, 0] * uv[:, 1], 2.0 - uv[:, 1]], axis=1)
-    np.testing.assert_allclose(back.cloth.initial_at(uv), expected, atol=1e-14)
+    np.testing.assert_allclose(back.cloth.interpolate_initial_positions(uv), expected, atol=1e-14)
     with pytest.raises(RecordingError, match="uv is not on the sheet"):
-        back.cloth.initial_at(uv + 0.2)
+        back.cloth.interpolate_initial_positions(uv + 0.2)
     with pytest.raises(RecordingError, match="no initial grid"):
-        replace(back.cloth, initial_vertices=None).initial_at(uv)
+        replace(back.cloth, initial_vertices=None).interpolate_initial_positions(uv)
 
 
 def test_a_sewn_garment_is_an_episode(assert_same, tmp_path):
@@ -85,16 +85,19 @@ def test_a_sewn_garment_is_an_episode(assert_same, tmp_path):
         uv=mesh.pattern,
         initial_vertices=mesh.vertices + np.array([0.0, 0.0, 1.0]),
     )
-    t, held = np.array([0.0, 1.0]), mesh.places["left shoulder"]
+    t, holding = np.array([0.0, 1.0]), mesh.places["left shoulder"]
     quat = np.array([[1.0, 0, 0, 0]] * 2)
     gripper = rec.GripperMotion(t, np.zeros((2, 3)), quat, np.array([True, True]))
     whole = rec.Recording(
-        cloth=cloth, provenance="synthetic: test", grasps={"g": rec.GraspInfo(vertices=held)}, grippers={"g": gripper}
+        cloth=cloth,
+        provenance="synthetic: test",
+        grasps={"g": rec.GraspInfo(vertices=holding)},
+        grippers={"g": gripper},
     )
     back = rec.read(rec.write(whole, tmp_path / "ep"))
     assert_same(whole, back)
     stored = json.loads((tmp_path / "ep" / "episode.json").read_text())
-    assert stored["grasps"] == {"g": {"vertices": held.tolist()}}
+    assert stored["grasps"] == {"g": {"vertices": holding.tolist()}}
     again = tc.meshes.Mesh.build(back.cloth.vertices, back.cloth.faces, back.cloth.uv)
     np.testing.assert_array_equal(again.rest, mesh.rest)
     np.testing.assert_array_equal(again.seams, mesh.seams)
@@ -152,7 +155,7 @@ def test_frames_and_images(episode, recording):
     assert len(back.points) == 3
     assert [len(back.points.frame(i)) for i in range(3)] == [30, 1, 17]
     np.testing.assert_array_equal(back.points.frame(-1), back.points.xyz[31:])
-    ends = back.points.only(np.array([True, False, True]))
+    ends = back.points.select(np.array([True, False, True]))
     assert ends.counts.tolist() == [30, 17]
     np.testing.assert_array_equal(ends.frame(1), back.points.frame(2))
     np.testing.assert_array_equal(ends.t, back.points.t[[0, 2]])
@@ -171,7 +174,7 @@ def test_frames_and_images(episode, recording):
     with pytest.raises(RecordingError, match="cannot be decoded"):
         camera.depth.load(0)
     with pytest.raises(RecordingError, match="cannot be decoded"):
-        list(camera.depth.files())  # nor handed on
+        list(camera.depth.iterate_files())  # nor handed on
     with pytest.raises(RecordingError, match="wrong size"):
         replace(camera.depth, size=(6, 8)).load(1)
 
@@ -253,12 +256,12 @@ def bad_recordings(recording):
     points = replace(recording.points, xyz=recording.points.xyz * np.nan)
     moved = replace(recording.grippers["right"], t=recording.grippers["right"].t + 1)
     camera = recording.cameras["cam0"]
-    lost = replace(camera.depth, paths=(camera.depth.paths[0], camera.depth.paths[0].with_name("lost.png")))
+    missing = replace(camera.depth, paths=(camera.depth.paths[0], camera.depth.paths[0].with_name("lost.png")))
     yield replace(recording, points=points), r"ep/points.npz: xyz is not finite; got nan at \[0, 0\]"
     yield replace(recording, extra={"what": object()}), "object cannot be stored as JSON"
     yield replace(recording, extra={"what": float("nan")}), "cannot be written"
     yield replace(recording, grippers={**recording.grippers, "right": moved}), r"grippers\['right'\].t differs"
-    yield replace(recording, cameras={"cam0": replace(camera, depth=lost)}), "lost.png"
+    yield replace(recording, cameras={"cam0": replace(camera, depth=missing)}), "lost.png"
     yield (
         replace(recording, cameras={"../up": replace(camera, depth=None)}),
         "cameras.*is not a plain name",
@@ -330,8 +333,8 @@ def test_frames_are_chosen_by_mask_number_or_slice(recording):
     points = recording.points
     mask = np.arange(len(points.t)) < 2
     for frames in (mask, [0, 1], slice(0, 2), np.array([1, 0])):
-        assert points.only(frames).t.tolist() == points.t[:2].tolist()
-        assert np.array_equal(points.only(frames).xyz, points.xyz[: points.counts[:2].sum()])
+        assert points.select(frames).t.tolist() == points.t[:2].tolist()
+        assert np.array_equal(points.select(frames).xyz, points.xyz[: points.counts[:2].sum()])
 
 
 def test_a_mask_of_indexed_colours_is_what_is_painted(tmp_path):

@@ -50,7 +50,7 @@ def test_what_is_absent_stays_absent(table, tmp_path):
 
 
 def test_repeats(table):
-    second = table.repeats(2)
+    second = table.select_repeats(2)
     assert second.force.tolist() == [0.1, 0.4]
     assert second.preload == table.preload
     assert second.extra == table.extra

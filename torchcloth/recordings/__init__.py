@@ -1,12 +1,13 @@
-"""Episodes on disk: the only room that opens recording files. Needs numpy only.
+"""Episodes on disk: the only package that opens recording files. It needs numpy only.
 
     recording = recordings.read("episodes/ep_01")
     recordings.write(recording, "episodes/copy")
 
-Readings of a tension machine are no episode: `ForceDisplacement`, `read_tension`, `write_tension`.
+Readings of a tension machine are no episode: see ``ForceDisplacement``, ``read_tension`` and ``write_tension``.
 
-A reader refuses what it cannot trust, with a one-line `RecordingError`; a stream that is merely missing is None.
-Other formats are read by `torchcloth.recordings.formats`.
+A reader refuses data that it cannot trust, by a ``RecordingError`` of one line. A stream that is absent is None. Other
+formats (ROS bags, LeRobot, Kinect, RGB-D folders) are read in ``torchcloth.recordings.formats``; a ROS bag in
+``formats/ros2.py``.
 """
 
 from __future__ import annotations

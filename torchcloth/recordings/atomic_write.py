@@ -1,4 +1,4 @@
-"""Puts a folder in its place atomically: written beside its final name first, and only then renamed."""
+"""Atomic writing of folders: a folder is written under a temporary name and then renamed."""
 
 from __future__ import annotations
 
@@ -12,25 +12,25 @@ from pathlib import Path
 from ..errors import RecordingError
 
 
-def place(target: Path, fill: Callable[[Path, Path], None], *, marker: str, overwrite: bool) -> Path:
-    """Make a folder; whatever fails, the final name holds the old folder or the new one, whole.
+def write_folder_atomically(target: Path, fill: Callable[[Path, Path], None], *, marker: str, overwrite: bool) -> Path:
+    """Write a folder. On any failure the final name holds the old folder or the new one, complete.
 
     Args:
         target: its final name.
         fill: called with (the folder to write into, its final name for messages).
-        marker: the file by which an old folder shows that it may be replaced.
-        overwrite: replace an old folder; one that lacks the marker is never replaced.
+        marker: the file that shows that an old folder may be replaced.
+        overwrite: replace an old folder; a folder without the marker is never replaced.
 
     Returns:
         ``target``.
 
     Raises:
-        RecordingError: the target exists, or ``fill`` refuses, or the disk fails.
+        RecordingError: the target exists, ``fill`` refuses, or the disk fails.
     """
     _check(target, marker, overwrite)
     part = target.absolute().with_name(f".{target.absolute().name}.{uuid.uuid4().hex}.partial")
     try:
-        with room_for(part):
+        with temporary_path(part):
             part.mkdir()
             fill(part, target)
             _sync_all(part)
@@ -43,15 +43,18 @@ def place(target: Path, fill: Callable[[Path, Path], None], *, marker: str, over
 
 
 @contextmanager
-def room_for(part: Path) -> Iterator[None]:
-    """Make the folders above; in the end what is left of ``part`` goes, and if all failed what was made for it."""
-    made = [folder for folder in part.parents if not folder.exists()]
+def temporary_path(part: Path) -> Iterator[None]:
+    """Create the folders above ``part`` and remove ``part`` at the end.
+
+    After a failure the created folders are removed as well.
+    """
+    created = [folder for folder in part.parents if not folder.exists()]
     try:
         part.parent.mkdir(parents=True, exist_ok=True)
         yield
     except BaseException:
         shutil.rmtree(part, ignore_errors=True)
-        for folder in made:
+        for folder in created:
             with suppress(OSError):
                 folder.rmdir()
         raise
@@ -70,9 +73,9 @@ def _check(target: Path, marker: str, overwrite: bool) -> None:
 
 
 def _put(part: Path, target: Path, overwrite: bool) -> None:
-    """Rename into place; an episode already there steps aside first and comes back on failure."""
+    """Rename into place. An existing episode is moved aside first and comes back after a failure."""
     old = part.with_suffix(".old")
-    if overwrite and target.exists():  # otherwise one that appeared meanwhile makes the rename below fail
+    if overwrite and target.exists():  # without overwrite, a folder that appeared meanwhile makes the rename below fail
         target.rename(old)
     try:
         part.rename(target)
@@ -80,19 +83,19 @@ def _put(part: Path, target: Path, overwrite: bool) -> None:
         if old.exists():
             old.rename(target)
         raise
-    sync(target.parent)
+    sync_to_disk(target.parent)
     shutil.rmtree(old, ignore_errors=True)
 
 
 def _sync_all(root: Path) -> None:
     for folder, _, files in os.walk(root, topdown=False):
         for file in files:
-            sync(Path(folder, file))
-        sync(Path(folder))
+            sync_to_disk(Path(folder, file))
+        sync_to_disk(Path(folder))
 
 
-def sync(path: Path) -> None:
-    """Bring a file or folder to the disk."""
+def sync_to_disk(path: Path) -> None:
+    """Flush a file or folder to the disk."""
     if path.is_dir() and os.name == "nt":  # Windows cannot open a folder
         return
     handle = os.open(path, os.O_RDONLY)

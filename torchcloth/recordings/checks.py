@@ -1,4 +1,4 @@
-"""Checks of single values. Each takes the place it looks at (file and key), so that a refusal can name it."""
+"""Checks of single values. Each takes the location (file and key) of the value for its message."""
 
 from __future__ import annotations
 
@@ -13,13 +13,14 @@ import numpy as np
 
 from ..errors import RecordingError
 
-LARGEST_SCENE = 20.0  # m; no cloth experiment spans more, and the same number in millimetres is a handkerchief
-FARTHEST_BASE = 100.0  # m; a base or camera may stand far from a map's origin, but not that far
-LONGEST_EPISODE = 86_400.0  # s
-HUGE = 1e100  # stands for infinity: nothing physical comes near, and squares of smaller numbers stay finite
+MAX_SCENE_EXTENT_M = 20.0  # no cloth experiment spans more; the same number in millimetres is a handkerchief
+MAX_BASE_DISTANCE_M = 100.0  # of a base or camera from a map's origin
+MAX_EPISODE_DURATION_S = 86_400.0
+MAX_FINITE_VALUE = 1e100  # larger values count as infinite; squares of smaller ones stay finite
 UNIT_TOLERANCE = 1e-3  # quaternions and rotations are often stored as float32 or with four digits
-EXACT = 1e-9  # of R R^T or a length: nothing was rounded
-ALIKE = 0.8  # of two keys, as difflib measures it: one of them is misspelt
+ROUNDING_TOLERANCE = 1e-9  # of R R^T or a length, below which the stored value is used as it is
+MIN_MISSPELLING_SIMILARITY = 0.8  # of two keys (difflib), above which one of them is a misspelling
+
 
 _KINDS = {"float": ("iuf", np.float64), "int": ("iu", np.int64), "bool": ("b", np.bool_)}
 _NAME = re.compile(r"[^./\\\x00][^/\\\x00]*")
@@ -28,7 +29,7 @@ P = ParamSpec("P")
 R = TypeVar("R")
 
 
-def array(
+def check_array(
     value: Any,
     place: str,
     shape: tuple[int | str, ...],
@@ -42,8 +43,11 @@ def array(
         value: array or nested list.
         place: file and key, for messages.
         shape: sizes that must match; a letter stands for any size.
-        kind: what the numbers are; whole numbers pass as "float".
+        kind: type of the numbers; integers are accepted as "float".
         nan: whether NaN is accepted, for "not seen".
+
+    Raises:
+        RecordingError: another shape or type, or numbers that are not finite.
     """
     letters, dtype = _KINDS[kind]
     try:
@@ -59,7 +63,7 @@ def array(
             f"{place} has the wrong shape", got=list(data.shape), expected=f"[{', '.join(map(str, shape))}]"
         )
     data = data.astype(dtype)
-    bad = ~(np.abs(data) < HUGE) if kind == "float" else np.zeros(data.shape, dtype=bool)
+    bad = ~(np.abs(data) < MAX_FINITE_VALUE) if kind == "float" else np.zeros(data.shape, dtype=bool)
     bad &= ~(np.isnan(data) & nan)
     if bad.any():
         where = [int(i) for i in np.argwhere(bad)[0]]
@@ -72,8 +76,12 @@ def array(
     return data
 
 
-def increasing(t: np.ndarray, place: str) -> None:
-    """Refuse times [N] s that are empty, repeat, run backwards, or are plainly not seconds."""
+def check_increasing(t: np.ndarray, place: str) -> None:
+    """Refuse times [N] s that are empty, repeat, decrease, or are obviously not seconds.
+
+    Raises:
+        RecordingError: names the first wrong sample.
+    """
     if t.size == 0:
         raise RecordingError(f"{place} is empty", expected="at least one time", remedy="leave the stream out instead")
     if (np.diff(t) <= 0).any():
@@ -82,28 +90,32 @@ def increasing(t: np.ndarray, place: str) -> None:
         raise RecordingError(
             f"{place} does not increase", got=got, expected="strictly increasing seconds", remedy="sort or drop samples"
         )
-    if t[-1] - t[0] > LONGEST_EPISODE:
+    if t[-1] - t[0] > MAX_EPISODE_DURATION_S:
         got = f"a duration of {t[-1] - t[0]:.4g}"
         raise RecordingError(
             f"{place} looks like milli- or nanoseconds", got=got, expected="seconds", remedy="rescale it"
         )
 
 
-def metres(points: np.ndarray, place: str) -> None:
-    """Refuse coordinates [..., D] whose extent can only be millimetres; rows with NaN do not count."""
+def check_metres(points: np.ndarray, place: str) -> None:
+    """Refuse coordinates [..., D] whose extent can only be millimetres; rows with NaN do not count.
+
+    Raises:
+        RecordingError: the extent is above 20 m.
+    """
     rows = points.reshape(-1, points.shape[-1])
     rows = rows[~np.isnan(rows).any(axis=1)]
     span = float(np.ptp(rows, axis=0).max()) if len(rows) else 0.0
-    if span > LARGEST_SCENE:
+    if span > MAX_SCENE_EXTENT_M:
         got = f"a span of {span:.4g}"
         raise RecordingError(f"{place} looks like millimetres", got=got, expected="metres", remedy="multiply by 0.001")
 
 
-def unit(vectors: np.ndarray, place: str) -> np.ndarray:
-    """Vectors or quaternions [..., D] of length one; those that were stored with few digits are made so.
+def normalise_unit(vectors: np.ndarray, place: str) -> np.ndarray:
+    """Return vectors or quaternions [..., D] of length one; those that were stored with few digits are normalised.
 
     Raises:
-        RecordingError: they are none.
+        RecordingError: a length differs from one by more than ``UNIT_TOLERANCE``.
     """
     length = np.linalg.norm(vectors, axis=-1, keepdims=True)
     off = np.abs(length - 1)
@@ -111,14 +123,16 @@ def unit(vectors: np.ndarray, place: str) -> np.ndarray:
         worst = int(np.argmax(off))
         got = f"length {length.reshape(-1)[worst]:.6g} at sample {worst}"
         raise RecordingError(f"{place} is not unit", got=got, expected="length 1", remedy="normalise it")
-    return np.where(off < EXACT, vectors, vectors / length)
+    return np.where(off < ROUNDING_TOLERANCE, vectors, vectors / length)
 
 
-def transform(matrix: np.ndarray, place: str) -> np.ndarray:
-    """A rigid motion in metres [4, 4]; one that was stored with few digits is rounded to the nearest rotation.
+def check_transform(matrix: np.ndarray, place: str) -> np.ndarray:
+    """Return a rigid transform [4, 4] in metres.
+
+    One that was stored with few digits is projected to the nearest rotation.
 
     Raises:
-        RecordingError: it is none.
+        RecordingError: the matrix is not rigid.
     """
     rotation = matrix[:3, :3]
     error = float(np.abs(rotation @ rotation.T - np.eye(3)).max())
@@ -132,10 +146,10 @@ def transform(matrix: np.ndarray, place: str) -> np.ndarray:
         raise RecordingError(
             f"{place} has a wrong last row", got=got, expected="[0, 0, 0, 1]", remedy="store it row by row"
         )
-    if np.abs(matrix[:3, 3]).max() > FARTHEST_BASE:
+    if np.abs(matrix[:3, 3]).max() > MAX_BASE_DISTANCE_M:
         got = matrix[:3, 3].tolist()
         raise RecordingError(f"{place} looks like millimetres", got=got, expected="metres", remedy="multiply by 0.001")
-    if error < EXACT:
+    if error < ROUNDING_TOLERANCE:
         return matrix
     left, _, right = np.linalg.svd(rotation)
     rigid = matrix.copy()
@@ -143,8 +157,12 @@ def transform(matrix: np.ndarray, place: str) -> np.ndarray:
     return rigid
 
 
-def name(value: str, place: str) -> str:
-    """Return a name that is safe as a file name and as an NPZ prefix."""
+def check_name(value: str, place: str) -> str:
+    """Return a name that is safe as a file name and as an NPZ prefix.
+
+    Raises:
+        RecordingError: it has slashes or begins with a dot.
+    """
     if not _NAME.fullmatch(value):
         expected = "one name without slashes that does not begin with a dot"
         raise RecordingError(f"{place} is not a plain name", got=repr(value), expected=expected, remedy="rename it")
@@ -152,109 +170,134 @@ def name(value: str, place: str) -> str:
 
 
 class Fields:
-    """Takes the keys of one mapping (JSON object or NPZ group) and remembers where it is and what was not taken.
+    """The keys of one mapping (JSON object or NPZ group), its location, and which keys were not taken.
 
-    The takers raise when a key is missing; ``maybe`` makes any of them optional (JSON null counts as missing).
+    Methods that take a key raise if it is missing; ``optional`` makes any of them optional (JSON null counts as
+    missing).
+
+    Attributes:
+        place: file and path of the mapping, for messages.
+        remaining: keys and values that were not taken yet.
+        requested: every key that was asked for.
     """
 
     def __init__(self, value: Any, place: str, joint: str = ".") -> None:
         if not isinstance(value, dict):
             raise RecordingError(f"{place} is not an object of named values", got=reprlib.repr(value))
-        self.place, self._joint, self.rest, self._given = place, joint, dict(value), set(value)
-        self.asked: list[str] = []  # every key that was looked for
+        self.place, self._joint, self.remaining, self._given = place, joint, dict(value), set(value)
+        self.requested: list[str] = []
 
-    def at(self, key: str) -> str:
-        """File and key, for messages."""
+    def location(self, key: str) -> str:
+        """Return file and key, for messages."""
         return f"{self.place}{self._joint}{key}"
 
     def has(self, key: str) -> bool:
-        """Whether the key is there and not null."""
-        self._ask(key)
-        return self.rest.get(key) is not None
+        """Return whether the key is there and not null."""
+        self._request(key)
+        return self.remaining.get(key) is not None
 
-    def _ask(self, key: str) -> None:
-        if key not in self.asked:
-            self.asked.append(key)
+    def _request(self, key: str) -> None:
+        if key not in self.requested:
+            self.requested.append(key)
 
     def take(self, key: str) -> Any:
-        """The raw value."""
-        self._ask(key)
-        value = self.rest.pop(key, None)
+        """Take the raw value of a key.
+
+        Raises:
+            RecordingError: the key is missing.
+        """
+        self._request(key)
+        value = self.remaining.pop(key, None)
         if value is None:
-            raise RecordingError(f"{self.at(key)} is missing", remedy="add it, see the recording format")
+            raise RecordingError(f"{self.location(key)} is missing", remedy="add it, see the recording format")
         return value
 
-    def maybe(self, taker: Callable[Concatenate[str, P], R], key: str, *args: P.args, **kwargs: P.kwargs) -> R | None:
-        """What ``taker`` gives for the key, or None when it is missing."""
+    def optional(
+        self, taker: Callable[Concatenate[str, P], R], key: str, *args: P.args, **kwargs: P.kwargs
+    ) -> R | None:
+        """Return the result of ``taker`` for the key, or None if the key is missing."""
         if self.has(key):
             return taker(key, *args, **kwargs)
-        self.rest.pop(key, None)
+        self.remaining.pop(key, None)
         return None
 
     def number(
         self,
         key: str,
         *,
-        least: float = -math.inf,
+        minimum: float = -math.inf,
         above: float = -math.inf,
-        most: float = math.inf,
+        maximum: float = math.inf,
         suspect: str = "",
     ) -> float:
-        """A finite number within bounds; beyond ``most`` it looks like the ``suspect`` unit."""
+        """Take a finite number within bounds; above ``maximum`` it looks like the unit ``suspect``.
+
+        Raises:
+            RecordingError: no such number.
+        """
         value = self.take(key)
-        if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) < HUGE:
-            raise RecordingError(f"{self.at(key)} is not a finite number", got=reprlib.repr(value), expected="a number")
-        if value > most:
+        if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) < MAX_FINITE_VALUE:
             raise RecordingError(
-                f"{self.at(key)} looks like {suspect}", got=value, expected=f"at most {most:g}", remedy="use SI units"
+                f"{self.location(key)} is not a finite number", got=reprlib.repr(value), expected="a number"
             )
-        if value < least or value <= above:
-            expected = f"at least {least:g}" if value < least else f"more than {above:g}"
-            raise RecordingError(f"{self.at(key)} is too small", got=value, expected=expected, remedy="correct it")
+        if value > maximum:
+            raise RecordingError(
+                f"{self.location(key)} looks like {suspect}",
+                got=value,
+                expected=f"at most {maximum:g}",
+                remedy="use SI units",
+            )
+        if value < minimum or value <= above:
+            expected = f"at least {minimum:g}" if value < minimum else f"more than {above:g}"
+            raise RecordingError(
+                f"{self.location(key)} is too small", got=value, expected=expected, remedy="correct it"
+            )
         return float(value)
 
-    def whole(self, key: str) -> int:
-        """A positive whole number."""
+    def whole_number(self, key: str) -> int:
+        """Take a positive integer."""
         value = self.number(key, above=0)
         if value != int(value):
-            raise RecordingError(f"{self.at(key)} is not whole", got=value, expected="a whole number")
+            raise RecordingError(f"{self.location(key)} is not whole", got=value, expected="a whole number")
         return int(value)
 
     def text(self, key: str) -> str:
-        """A non-empty string."""
+        """Take a non-empty string."""
         value = self.take(key)
         if not isinstance(value, str) or not value:
-            raise RecordingError(f"{self.at(key)} is not text", got=reprlib.repr(value), expected="a non-empty string")
+            raise RecordingError(
+                f"{self.location(key)} is not text", got=reprlib.repr(value), expected="a non-empty string"
+            )
         return value
 
     def array(
         self, key: str, *shape: int | str, kind: Literal["float", "int", "bool"] = "float", nan: bool = False
     ) -> np.ndarray:
-        """An array, see `array`."""
-        return array(self.take(key), self.at(key), shape, kind, nan=nan)
+        """Take an array, see ``check_array``."""
+        return check_array(self.take(key), self.location(key), shape, kind, nan=nan)
 
-    def inside(self, key: str) -> Fields:
-        """The object under the key; an absent one is empty."""
-        self._ask(key)
-        value = self.rest.pop(key, None)
-        return Fields({} if value is None else value, self.at(key))
+    def group(self, key: str) -> Fields:
+        """Take the object under the key; a missing one is empty."""
+        self._request(key)
+        value = self.remaining.pop(key, None)
+        return Fields({} if value is None else value, self.location(key))
 
-    def each(self, key: str) -> dict[str, Fields]:
-        """The named objects under the key."""
-        group = self.inside(key)
-        return {name(k, f"{group.place} name"): group.inside(k) for k in list(group.rest)}
+    def named_groups(self, key: str) -> dict[str, Fields]:
+        """Take the named objects under the key."""
+        group = self.group(key)
+        return {check_name(k, f"{group.place} name"): group.group(k) for k in list(group.remaining)}
 
-    def left(self, **groups: Fields) -> dict[str, Any]:
-        """What nobody took, here and, under their own names, in the small groups inside.
+    def unknown_keys(self, **groups: Fields) -> dict[str, Any]:
+        """Return the keys that were not taken, here and, under their own names, in the small groups in_groups.
 
         Raises:
-            RecordingError: a key that is nearly one that is looked for and not there: misspelt, it would be ignored.
+            RecordingError: a key resembles a known one that is absent: as a typo it would be ignored.
         """
-        absent = [key for key in self.asked if key not in self._given]
-        for key in self.rest:
-            if meant := get_close_matches(key, absent, 1, ALIKE):
+        absent = [key for key in self.requested if key not in self._given]
+        for key in self.remaining:
+            if suggestions := get_close_matches(key, absent, 1, MIN_MISSPELLING_SIMILARITY):
                 raise RecordingError(
-                    f"{self.at(key)} is unknown", got=repr(key), expected=repr(meant[0]), remedy="rename it"
+                    f"{self.location(key)} is unknown", got=repr(key), expected=repr(suggestions[0]), remedy="rename it"
                 )
-        inside = {key: group.left() for key, group in groups.items()}
-        return {**self.rest, **{key: rest for key, rest in inside.items() if rest}}
+        in_groups = {key: group.unknown_keys() for key, group in groups.items()}
+        return {**self.remaining, **{key: unknown for key, unknown in in_groups.items() if unknown}}

@@ -1,4 +1,4 @@
-"""Opens the files of one episode folder; whatever is wrong with a file becomes one `RecordingError`."""
+"""Files of one episode folder; any fault of a file becomes one ``RecordingError``."""
 
 from __future__ import annotations
 
@@ -16,94 +16,101 @@ from . import checks
 
 
 class Folder:
-    """An episode folder; ``shown`` is the name used in messages (a write checks its work under the final name).
+    """An episode folder.
 
-    ``held`` are files by name that lie in memory instead, as those that another format carries.
+    Args:
+        path: the folder.
+        display_path: its name in messages; a writer checks its work under the final name.
+        in_memory: files by name whose bytes lie in memory, such as files inside another format.
     """
 
-    def __init__(self, path: Path, shown: Path | None = None, held: Mapping[str, bytes] | None = None) -> None:
-        self.path, self.shown, self.held = path, shown or path, held or {}
+    def __init__(
+        self, path: Path, display_path: Path | None = None, in_memory: Mapping[str, bytes] | None = None
+    ) -> None:
+        self.path, self.display_path, self.in_memory = path, display_path or path, in_memory or {}
 
-    def place(self, name: str) -> str:
-        """The file's name in messages."""
-        return str(self.shown / name)
+    def location(self, name: str) -> str:
+        """Return the file's name for messages."""
+        return str(self.display_path / name)
 
-    def sub(self, name: str) -> Folder:
-        """A folder inside this one."""
-        return Folder(self.path / name, self.shown / name)
+    def subfolder(self, name: str) -> Folder:
+        """Return a folder inside this one."""
+        return Folder(self.path / name, self.display_path / name)
 
     def has(self, name: str) -> bool:
-        """Whether a file or folder of this name lies here."""
+        """Return whether a file or folder of this name exists here."""
         try:
-            return name in self.held or (self.path / name).exists()
+            return name in self.in_memory or (self.path / name).exists()
         except (OSError, ValueError):  # a name that no file system can hold
             return False
 
-    def data(self, name: str) -> bytes:
-        """The bytes of a file that must be there."""
-        place = self.place(name)
-        checks.name(name, f"{place} file name")
+    def read_bytes(self, name: str) -> bytes:
+        """Return the bytes of a file that must exist."""
+        place = self.location(name)
+        checks.check_name(name, f"{place} file name")
         if not self.has(name):
             raise RecordingError(f"{place} is missing", expected="a file", remedy="restore it or stop naming it")
-        if name in self.held:
-            return self.held[name]
+        if name in self.in_memory:
+            return self.in_memory[name]
         try:
             return (self.path / name).read_bytes()
         except OSError as error:
             raise RecordingError(f"{place} cannot be read", got=error.strerror, expected="a readable file") from error
 
-    def text(self, name: str) -> str:
-        """The text of a UTF-8 file."""
+    def read_text(self, name: str) -> str:
+        """Return the text of a UTF-8 file."""
         try:
-            return self.data(name).decode()
+            return self.read_bytes(name).decode()
         except UnicodeDecodeError as error:
             raise RecordingError(
-                f"{self.place(name)} is not UTF-8 text", got=error.reason, remedy="restore it"
+                f"{self.location(name)} is not UTF-8 text", got=error.reason, remedy="restore it"
             ) from error
 
-    def json(self, name: str) -> checks.Fields:
-        """The JSON object in a file."""
+    def read_json(self, name: str) -> checks.Fields:
+        """Read the JSON object in a file."""
         try:
-            value = json.loads(self.text(name), parse_constant=_no_constant, object_pairs_hook=_once)
+            value = json.loads(
+                self.read_text(name), parse_constant=_reject_constant, object_pairs_hook=_reject_repeated_keys
+            )
         except RecordingError:
             raise
         except (ValueError, RecursionError) as error:
             raise RecordingError(
-                f"{self.place(name)} is not valid JSON", got=error, remedy="restore or repair it"
+                f"{self.location(name)} is not valid JSON", got=error, remedy="restore or repair it"
             ) from error
-        return checks.Fields(value, self.place(name), ": ")
+        return checks.Fields(value, self.location(name), ": ")
 
-    def npz(self, name: str) -> dict[str, np.ndarray]:
-        """The arrays of an NPZ file; pickled objects are never loaded."""
+    def read_npz(self, name: str) -> dict[str, np.ndarray]:
+        """Read the arrays of an NPZ file; pickled objects are never loaded."""
         arrays = self._load(name)
         if not isinstance(arrays, dict):
             raise RecordingError(
-                f"{self.place(name)} is not an NPZ archive", got="one bare array", expected="named arrays"
+                f"{self.location(name)} is not an NPZ archive", got="one bare array", expected="named arrays"
             )
         return arrays
 
-    def npy(self, name: str) -> np.ndarray:
-        """The array of an NPY file."""
+    def read_npy(self, name: str) -> np.ndarray:
+        """Read the array of an NPY file."""
         data = self._load(name)
         if isinstance(data, dict):
-            raise RecordingError(f"{self.place(name)} is not an NPY array", got="an archive", expected="one array")
+            raise RecordingError(f"{self.location(name)} is not an NPY array", got="an archive", expected="one array")
         return data
 
     def _load(self, name: str) -> dict[str, np.ndarray] | np.ndarray:
-        data = self.data(name)
+        data = self.read_bytes(name)
         try:
             loaded = np.load(io.BytesIO(data), allow_pickle=False)
             arrays = {key: loaded[key] for key in loaded.files} if isinstance(loaded, np.lib.npyio.NpzFile) else loaded
         except Exception as error:  # a damaged archive can raise almost anything: zlib, struct, numpy, memory
             raise RecordingError(
-                f"{self.place(name)} is truncated, corrupt or holds pickled objects",
+                f"{self.location(name)} is truncated, corrupt or holds pickled objects",
                 got=type(error).__name__,  # numpy's own words advise to load it unsafely
                 expected="plain numpy arrays",
                 remedy="record or copy it again",
             ) from error
         for key, value in arrays.items() if isinstance(arrays, dict) else ():
             if not isinstance(value, np.ndarray):
-                raise RecordingError(f"{self.place(name)}: {key} is not an array", expected="plain numpy arrays")
+                raise RecordingError(f"{self.location(name)}: {key} is not an array", expected="plain numpy arrays")
         return arrays
 
 
@@ -117,14 +124,14 @@ def save_npz(file: Path | BinaryIO, arrays: Mapping[str, Any]) -> None:
                 np.lib.format.write_array(opened, np.asarray(value), allow_pickle=False)
 
 
-def _once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    """An object of a file that someone edited: of a key that stands there twice, one would be ignored."""
-    found = dict(pairs)
-    if len(found) < len(pairs):
+def _reject_repeated_keys(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    """Refuse an object in which a key occurs twice: one of its values would be ignored."""
+    values = dict(pairs)
+    if len(values) < len(pairs):
         keys = [key for key, _ in pairs]
         raise ValueError(f"{next(key for key in keys if keys.count(key) > 1)!r} twice in an object")
-    return found
+    return values
 
 
-def _no_constant(text: str) -> NoReturn:
+def _reject_constant(text: str) -> NoReturn:
     raise ValueError(f"{text} is no JSON number")

@@ -1,4 +1,4 @@
-"""Images of a camera, in folders or inside a file of another format: decoded only when asked for."""
+"""Images of a camera, in folders or inside a file of another format; they are decoded only when needed."""
 
 from __future__ import annotations
 
@@ -18,35 +18,44 @@ from ..errors import MissingDependency, RecordingError
 from . import checks
 from .files import Folder
 
-Kind = Literal["depth", "color", "mask"]
-KINDS: tuple[Kind, ...] = ("depth", "color", "mask")
-TIMESTAMPS = "timestamps.csv"
-PNG = b"\x89PNG\r\n\x1a\n"
+ImageKind = Literal["depth", "color", "mask"]
+IMAGE_KINDS: tuple[ImageKind, ...] = ("depth", "color", "mask")
+TIMESTAMPS_FILE = "timestamps.csv"
+PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 _COLUMNS = ["frame", "t_color", "t_depth"]
-_SUFFIXES: dict[Kind, set[str]] = {"depth": {".png"}, "color": {".jpg", ".jpeg", ".png"}, "mask": {".png"}}
+_SUFFIXES: dict[ImageKind, set[str]] = {"depth": {".png"}, "color": {".jpg", ".jpeg", ".png"}, "mask": {".png"}}
 
 
 class ImageSource(ABC):
-    """Images inside a file of another format, decoded one after the other; it can be run through again."""
+    """Images inside a file of another format, decoded one after the other; it can be iterated repeatedly."""
 
     @abstractmethod
     def __iter__(self) -> Iterator[np.ndarray | bytes]:
-        """Each image: its pixels as `ImageStream.load` gives them, or the bytes of a whole PNG or JPEG file."""
+        """Iterate over pixels as ``ImageStream.load`` gives them, or bytes of whole PNG or JPEG files."""
 
     def file(self, i: int) -> Path | None:
-        """The file that image ``i`` has of its own, for messages."""
+        """Return the file of image ``i`` for messages; None if it has no file of its own."""
         return None
 
 
 @dataclass(frozen=True, eq=False)
 class ImageStream:
-    """N images of one kind with their times: files of their own, or decoded from a source when they are written."""
+    """N images of one kind with their times: files, or a source from which they are decoded when they are written.
 
-    kind: Kind
-    frames: np.ndarray  # [N] frame numbers, as in the file names
-    t: np.ndarray  # [N] s
-    paths: tuple[Path, ...]  # one per image; empty with a source
-    size: tuple[int, int]  # (width, height) in pixels
+    Attributes:
+        kind: "depth", "color" or "mask".
+        frames: [N] frame numbers, as in the file names.
+        t: [N] s.
+        paths: one file per image; empty with a source.
+        size: (width, height) in pixels.
+        source: gives the images if there are no files.
+    """
+
+    kind: ImageKind
+    frames: np.ndarray
+    t: np.ndarray
+    paths: tuple[Path, ...]
+    size: tuple[int, int]
     source: ImageSource | None = None
 
     def __len__(self) -> int:
@@ -55,22 +64,23 @@ class ImageStream:
     def load(self, i: int) -> np.ndarray:
         """Decode image ``i``: depth uint16 [H, W] (0 = invalid), colour uint8 [H, W, 3], mask bool [H, W].
 
-        From a source this runs through all images before it; write the episode first to read many.
+        A source is iterated from its beginning for each call; write the episode first to read many images.
 
         Raises:
             RecordingError: the file is damaged or does not have the camera's size.
             MissingDependency: Pillow is not installed.
         """
         if self.source is None:
-            return self._decoded(self.paths[i], str(self.paths[i]))
+            return self._decode_checked(self.paths[i], str(self.paths[i]))
         for image in islice(self.source, range(len(self))[i], None):
-            return self._decoded(image, self._place(i, i))
+            return self._decode_checked(image, self._place(i, i))
         raise RecordingError(f"{self.kind} image {i} is missing", expected=f"{len(self)} images", remedy="record again")
 
-    def files(self) -> Iterator[tuple[int, str, bytes]]:
-        """Frame number, suffix and bytes of each image as a file; those of a source are decoded and checked.
+    def iterate_files(self) -> Iterator[tuple[int, str, bytes]]:
+        """Iterate over frame number, suffix and bytes of each image as a file.
 
-        Pixels become PNG, which keeps every one of them; PNG and JPEG files stay as they are.
+        Images of a source are decoded and checked. Pixels are stored as PNG without loss; PNG and JPEG files stay as
+        they are.
         """
         frames = self.frames.tolist()
         i = -1
@@ -79,32 +89,32 @@ class ImageStream:
                 raise RecordingError(f"{self.kind} images are too many", expected=f"{len(self)}, one for each time")
             if isinstance(image, Path):
                 data = image.read_bytes()
-                self._decoded(data, str(image))  # what is damaged is not handed on
+                self._decode_checked(data, str(image))  # a damaged image is not passed on
                 yield frames[i], image.suffix, data
             else:
-                yield frames[i], *self._file(image, self._place(i, frames[i]))
+                yield frames[i], *self._encode_file(image, self._place(i, frames[i]))
         if i + 1 < len(frames):
             raise RecordingError(f"{self.kind} image {frames[i + 1]} is missing", expected="one for each time")
 
     def _place(self, i: int, number: int) -> str:
-        """What image ``i`` is called in messages."""
+        """Name of image ``i`` in messages."""
         file = None if self.source is None else self.source.file(i)
         return f"{self.kind} image {number}" if file is None else f"{file}: {self.kind} image {number}"
 
-    def _file(self, image: np.ndarray | bytes, place: str) -> tuple[str, bytes]:
-        pixels = self._decoded(image, place)
+    def _encode_file(self, image: np.ndarray | bytes, place: str) -> tuple[str, bytes]:
+        pixels = self._decode_checked(image, place)
         if isinstance(image, bytes):
-            suffix = ".png" if image.startswith(PNG) else ".jpg"
+            suffix = ".png" if image.startswith(PNG_SIGNATURE) else ".jpg"
             if suffix not in _SUFFIXES[self.kind]:
                 raise RecordingError(f"{place} is JPEG", expected="PNG", remedy="export without loss")
             return suffix, image
         grey = pixels.astype(np.uint8) * np.uint8(255) if self.kind == "mask" else pixels
         file = io.BytesIO()
-        pillow().fromarray(grey).save(file, "PNG", compress_level=1)  # 6 takes 4 times as long for a tenth less
+        import_pillow().fromarray(grey).save(file, "PNG", compress_level=1)  # 6 takes 4 times as long for a tenth less
         return ".png", file.getvalue()
 
-    def _decoded(self, image: Path | bytes | np.ndarray, place: str) -> np.ndarray:
-        """The pixels of a file or of its bytes, of the kind's type and the camera's size."""
+    def _decode_checked(self, image: Path | bytes | np.ndarray, place: str) -> np.ndarray:
+        """Pixels of a file or of its bytes, of the kind's type and the camera's size."""
         pixels = image if isinstance(image, np.ndarray) else _decode(image, place, rgb=self.kind == "color")
         if self.kind == "depth" and pixels.dtype != np.uint16:
             raise RecordingError(
@@ -114,18 +124,22 @@ class ImageStream:
             raise RecordingError(
                 f"{place} has the wrong size", got=pixels.shape[1::-1], expected=f"{self.size}, as calibrated"
             )
-        return _painted(pixels.reshape(*self.size[::-1], -1)) if self.kind == "mask" else pixels
+        return _to_mask(pixels.reshape(*self.size[::-1], -1)) if self.kind == "mask" else pixels
 
 
-def _painted(pixels: np.ndarray) -> np.ndarray:
-    """[H, W] bool of [H, W, C]: what is neither black nor, where the last channel is alpha, transparent."""
+def _to_mask(pixels: np.ndarray) -> np.ndarray:
+    """Mask [H, W] of pixels [H, W, C]: neither black nor, if the last channel is alpha, transparent."""
     if pixels.shape[-1] in (2, 4):
         pixels = pixels[..., :-1] * (pixels[..., -1:] > 0)
     return np.any(pixels, axis=-1, keepdims=False)
 
 
-def pillow() -> Any:
-    """Pillow's module Image."""
+def import_pillow() -> Any:
+    """Import Pillow's module Image.
+
+    Raises:
+        MissingDependency: Pillow is not installed.
+    """
     try:
         from PIL import Image  # pyright: ignore[reportMissingImports]  (optional)
     except ImportError as error:
@@ -134,30 +148,30 @@ def pillow() -> Any:
 
 
 def _decode(image: Path | bytes, place: str, *, rgb: bool) -> np.ndarray:
-    reader = pillow()
+    reader = import_pillow()
     try:
         data = image if isinstance(image, bytes) else image.read_bytes()
-        if data.startswith(PNG):
-            reader.open(io.BytesIO(data)).verify()  # checksums, which decoding does not look at
+        if data.startswith(PNG_SIGNATURE):
+            reader.open(io.BytesIO(data)).verify()  # decoding does not verify the checksums
         with reader.open(io.BytesIO(data)) as opened:
-            indexed = "RGBA" if opened.mode in ("P", "PA") else None  # of a palette's colours, not its numbers
+            indexed = "RGBA" if opened.mode in ("P", "PA") else None  # use the palette's colours, not its indices
             mode = "RGB" if rgb else indexed
             return np.asarray(opened if mode is None else opened.convert(mode))
     except Exception as error:  # a damaged image raises whatever its decoder pleases
         raise RecordingError(f"{place} cannot be decoded", got=type(error).__name__, remedy="restore it") from error
 
 
-def find_streams(folder: Folder, size: tuple[int, int]) -> dict[Kind, ImageStream]:
+def list_image_streams(folder: Folder, size: tuple[int, int]) -> dict[ImageKind, ImageStream]:
     """List the image folders of one camera.
 
-    Masks take the depth image's time, or the colour image's where there is no depth.
+    Masks take the depth image's time, or the colour image's if there is no depth.
     """
-    present: list[Kind] = [kind for kind in KINDS if folder.has(kind)]
+    present: list[ImageKind] = [kind for kind in IMAGE_KINDS if folder.has(kind)]
     if not present:
         return {}
     color, depth = _read_times(folder)
-    times: dict[Kind, dict[int, float]] = {"color": color, "depth": depth, "mask": color | depth}
-    streams: dict[Kind, ImageStream] = {}
+    times: dict[ImageKind, dict[int, float]] = {"color": color, "depth": depth, "mask": color | depth}
+    streams: dict[ImageKind, ImageStream] = {}
     for kind in present:
         paths = _list(folder, kind)
         if kind == "mask":
@@ -166,25 +180,27 @@ def find_streams(folder: Folder, size: tuple[int, int]) -> dict[Kind, ImageStrea
         if wrong:
             got = f"frame {wrong[0]} in only one of them"
             raise RecordingError(
-                f"{folder.place(kind)} and {TIMESTAMPS} do not match", got=got, remedy="give each image one time"
+                f"{folder.location(kind)} and {TIMESTAMPS_FILE} do not match",
+                got=got,
+                remedy="give each image one time",
             )
         frames = np.array(sorted(paths), dtype=np.int64)
         t = np.array([times[kind][n] for n in frames.tolist()], dtype=float)
-        checks.increasing(t, f"{folder.place(TIMESTAMPS)}: t of {kind}")
+        checks.check_increasing(t, f"{folder.location(TIMESTAMPS_FILE)}: t of {kind}")
         streams[kind] = ImageStream(kind, frames, t, tuple(paths[n] for n in frames.tolist()), size)
     return streams
 
 
-def dump_times(streams: dict[Kind, ImageStream]) -> str:
-    """The text of timestamps.csv; masks without depth images are timed in the depth column."""
+def format_timestamps(streams: dict[ImageKind, ImageStream]) -> str:
+    """Return the text of timestamps.csv; masks without depth images are timed in the depth column."""
     times = {kind: dict(zip(s.frames.tolist(), s.t.tolist(), strict=True)) for kind, s in streams.items()}
     color, depth = times.get("color", {}), times.get("depth", times.get("mask", {}))
     rows = [f"{n},{color.get(n, '')},{depth.get(n, '')}" for n in sorted(color.keys() | depth.keys())]
     return "\n".join([",".join(_COLUMNS), *rows]) + "\n"
 
 
-def _list(folder: Folder, kind: Kind) -> dict[int, Path]:
-    place = folder.place(kind)
+def _list(folder: Folder, kind: ImageKind) -> dict[int, Path]:
+    place = folder.location(kind)
     try:
         paths = [p for p in (folder.path / kind).iterdir() if p.suffix.lower() in _SUFFIXES[kind]]
     except OSError as error:
@@ -200,11 +216,11 @@ def _list(folder: Folder, kind: Kind) -> dict[int, Path]:
 
 def _read_times(folder: Folder) -> tuple[dict[int, float], dict[int, float]]:
     """Times of the colour and depth images by frame number; an empty cell means no image."""
-    place = folder.place(TIMESTAMPS)
+    place = folder.location(TIMESTAMPS_FILE)
     color: dict[int, float] = {}
     depth: dict[int, float] = {}
     try:
-        header, *rows = csv.reader(folder.text(TIMESTAMPS).splitlines())
+        header, *rows = csv.reader(folder.read_text(TIMESTAMPS_FILE).splitlines())
         if [cell.strip() for cell in header] != _COLUMNS:
             raise ValueError(f"header {header}")
         if len({int(row[0]) for row in rows}) < len(rows):

@@ -1,4 +1,4 @@
-"""Reads one episode folder and checks that its parts fit together."""
+"""Reader of one episode folder, with checks that its parts fit together."""
 
 from __future__ import annotations
 
@@ -8,89 +8,94 @@ from typing import Any
 
 import numpy as np
 
+from .._utils.constants import STANDARD_GRAVITY_M_PER_S2
 from ..errors import RecordingError
 from . import images, scene, streams
 from .checks import Fields
 from .files import Folder
-from .timing import SLOWEST
+from .timing import MAX_FRAME_INTERVAL_S
 from .types import Camera, GraspInfo, Recording
 
-EPISODE = "episode.json"
-FORMAT, VERSION = "torchcloth-recording", 1
-RIZON_JOINTS = 7
-STRONGEST_GRAVITY = 100.0  # m/s^2; above this it is in mm/s^2
-DENSEST_AIR = 100.0  # kg/m^3; above this it is in g/m^3, or water
-FEW_TICKS, FAR_LONGER = 5, 100.0  # of a stream, before its spacing says something; spans in one unit differ by less
-MARKER_SLACK = 0.01  # of the pattern's longer side: a marker's pattern coordinates are measured by hand
+EPISODE_FILE = "episode.json"
+EPISODE_FORMAT, EPISODE_VERSION = "torchcloth-recording", 1
+EPISODE_SCHEMA = "torchcloth.episode/1"
+RIZON_JOINT_COUNT = 7
+MAX_GRAVITY_M_PER_S2 = 100.0  # above this it is in mm/s^2
+MAX_AIR_DENSITY_KG_PER_M3 = 100.0  # above this it is in g/m^3, or water
+MIN_TIMED_FRAMES = 5  # a stream of fewer frames has no reliable interval
+MAX_SPAN_RATIO = 100.0  # of the durations of two streams in one unit
+MARKER_UV_TOLERANCE = 0.01  # of the pattern's longer side; pattern coordinates of markers are measured by hand
 
 
 def read(path: str | Path, *, with_truth: bool = False) -> Recording:
-    """Read an episode and refuse it when it cannot be trusted.
+    """Read an episode, and refuse it if it cannot be trusted.
 
     Args:
         path: the episode folder.
-        with_truth: also read truth.npz. Only for scoring: identify and diagnose must never see it.
+        with_truth: also read truth.npz. Only for scoring: identification and diagnosis must never see it.
 
     Raises:
-        RecordingError: names the file and key, what was found, what was expected and the remedy.
+        RecordingError: names the file and key, what was there, what was expected and the remedy.
     """
     return read_folder(Folder(Path(path)), with_truth=with_truth)
 
 
 def read_folder(folder: Folder, *, with_truth: bool) -> Recording:
-    """Read an opened folder, see `read`."""
-    _refuse_no_episode(folder)
-    root = folder.json(EPISODE)
+    """Read an opened folder, see ``read``."""
+    _check_is_episode(folder)
+    root = folder.read_json(EPISODE_FILE)
     _check_version(root)
-    groups = streams.groups(folder) if folder.has(streams.MOTION) else {}
-    grippers, joints = streams.motions(groups, folder.place(streams.MOTION))
-    clouds = folder.npz(streams.POINTS) if folder.has(streams.POINTS) else None
-    held = {
+    groups = streams.read_motion_groups(folder) if folder.has(streams.MOTION_FILE) else {}
+    grippers, joints = streams.parse_motions(groups, folder.location(streams.MOTION_FILE))
+    clouds = folder.read_npz(streams.POINTS_FILE) if folder.has(streams.POINTS_FILE) else None
+    contents = {
         "grippers": grippers,
         "joints": joints,
-        "points": None if clouds is None else streams.points(clouds, folder.place(streams.POINTS)),
-        "markers": streams.markers(folder) if folder.has(streams.MARKERS) else None,
-        "truth": streams.truth(folder) if with_truth and folder.has(streams.TRUTH) else None,
-        "path": folder.shown,
+        "points": None if clouds is None else streams.parse_points(clouds, folder.location(streams.POINTS_FILE)),
+        "markers": streams.read_markers(folder) if folder.has(streams.MARKERS_FILE) else None,
+        "truth": streams.read_truth(folder) if with_truth and folder.has(streams.TRUTH_FILE) else None,
+        "path": folder.display_path,
     }
-    return assemble(root, folder, held, lambda name, size: images.find_streams(folder.sub(name), size))
+    return assemble_recording(
+        root, folder, contents, lambda name, size: images.list_image_streams(folder.subfolder(name), size)
+    )
 
 
-def assemble(
+def assemble_recording(
     root: Fields,
     folder: Folder,
-    held: dict[str, Any],
-    images_of: Callable[[str, tuple[int, int]], dict[images.Kind, images.ImageStream]],
+    contents: dict[str, Any],
+    images_of: Callable[[str, tuple[int, int]], dict[images.ImageKind, images.ImageStream]],
 ) -> Recording:
-    """Put what episode.json says together with the streams, and check that they fit.
+    """Assemble a recording from episode.json and its streams, and check that they fit.
 
     Args:
         root: the object in episode.json.
         folder: where the files lie that it names; for messages, where the episode lies.
-        held: the streams, by the names of `Recording`.
-        images_of: finds the images of a camera by its name and (width, height).
+        contents: the streams, by the names of ``Recording``.
+        images_of: lists the images of a camera, given its name and (width, height).
     """
     gravity = _gravity(root)
-    noise, air = root.inside("observation_noise"), root.inside("air")
+    noise, air = root.group("observation_noise"), root.group("air")
 
     def camera(name: str, fields: Fields) -> Camera:
-        return scene.camera(fields, lambda size: images_of(name, size))
+        return scene.read_camera(fields, lambda size: images_of(name, size))
 
     recording = Recording(
-        cloth=scene.cloth(_needed(root, "cloth"), folder),
+        cloth=scene.read_cloth(_require_group(root, "cloth"), folder),
         provenance=_provenance(root),
-        grasps={name: scene.grasp(f) for name, f in root.each("grasps").items()},
-        robots={name: scene.robot(f) for name, f in root.each("robots").items()},
-        cameras={name: camera(name, f) for name, f in root.each("cameras").items()},
-        colliders={name: scene.collider(f) for name, f in root.each("colliders").items()},
-        observation_noise_std=noise.maybe(noise.number, "std", least=0, most=1, suspect="millimetres"),
-        clock_offset=root.maybe(root.number, "clock_offset") or 0.0,
-        gravity=np.array([0.0, 0.0, -9.81]) if gravity is None else gravity,
-        air_density=air.maybe(air.number, "density", above=0, most=DENSEST_AIR, suspect="g/m^3"),
+        grasps={name: scene.read_grasp(f) for name, f in root.named_groups("grasps").items()},
+        robots={name: scene.read_robot(f) for name, f in root.named_groups("robots").items()},
+        cameras={name: camera(name, f) for name, f in root.named_groups("cameras").items()},
+        colliders={name: scene.read_collider(f) for name, f in root.named_groups("colliders").items()},
+        observation_noise_std=noise.optional(noise.number, "std", minimum=0, maximum=1, suspect="millimetres"),
+        clock_offset=root.optional(root.number, "clock_offset") or 0.0,
+        gravity=np.array([0.0, 0.0, -STANDARD_GRAVITY_M_PER_S2]) if gravity is None else gravity,
+        air_density=air.optional(air.number, "density", above=0, maximum=MAX_AIR_DENSITY_KG_PER_M3, suspect="g/m^3"),
         split=_split(root),
-        licence=root.maybe(root.text, "licence"),
-        extra=root.left(observation_noise=noise, air=air),
-        **held,
+        licence=root.optional(root.text, "licence"),
+        extra=root.unknown_keys(observation_noise=noise, air=air),
+        **contents,
     )
     _check_cloth(recording, root.place)
     for name in recording.grasps:
@@ -103,47 +108,63 @@ def assemble(
 
 
 def _gravity(root: Fields) -> np.ndarray | None:
-    gravity = root.maybe(root.array, "gravity", 3)
-    if gravity is not None and np.linalg.norm(gravity) > STRONGEST_GRAVITY:
+    gravity = root.optional(root.array, "gravity", 3)
+    if gravity is not None and np.linalg.norm(gravity) > MAX_GRAVITY_M_PER_S2:
         raise RecordingError(
-            f"{root.at('gravity')} looks like mm/s^2",
+            f"{root.location('gravity')} looks like mm/s^2",
             got=gravity.tolist(),
-            expected=f"at most {STRONGEST_GRAVITY:g} m/s^2 in length",
+            expected=f"at most {MAX_GRAVITY_M_PER_S2:g} m/s^2 in length",
             remedy="use SI units",
         )
     return gravity
 
 
-def _refuse_no_episode(folder: Folder) -> None:
+def _check_is_episode(folder: Folder) -> None:
     if not folder.has("."):
-        raise RecordingError(f"{folder.shown} does not exist", expected="an episode folder", remedy="check the path")
+        raise RecordingError(
+            f"{folder.display_path} does not exist", expected="an episode folder", remedy="check the path"
+        )
     if not folder.path.is_dir():
         raise RecordingError(
-            f"{folder.shown} is a file",
+            f"{folder.display_path} is a file",
             expected="an episode folder",
             remedy="pass the folder around it, or make one of another format with `torchcloth convert`",
         )
-    if not folder.has(EPISODE):
+    if not folder.has(EPISODE_FILE):
         raise RecordingError(
-            f"{folder.place(EPISODE)} is missing", expected="an episode folder", remedy="check the path"
+            f"{folder.location(EPISODE_FILE)} is missing", expected="an episode folder", remedy="check the path"
         )
 
 
 def _check_version(root: Fields) -> None:
     got = root.text("format")
-    if got != FORMAT:
+    if got != EPISODE_FORMAT:
         raise RecordingError(
-            f"{root.at('format')} is unknown", got=repr(got), expected=repr(FORMAT), remedy="convert it first"
+            f"{root.location('format')} is unknown",
+            got=repr(got),
+            expected=repr(EPISODE_FORMAT),
+            remedy="convert it first",
+        )
+    schema = root.optional(root.text, "schema")
+    if schema not in (None, EPISODE_SCHEMA):
+        raise RecordingError(
+            f"{root.location('schema')} is unknown",
+            got=repr(schema),
+            expected=repr(EPISODE_SCHEMA),
+            remedy="update torchcloth",
         )
     version = root.number("version")
-    if version != VERSION:
+    if version != EPISODE_VERSION:
         raise RecordingError(
-            f"{root.at('version')} is unknown", got=f"{version:g}", expected=f"{VERSION}", remedy="update torchcloth"
+            f"{root.location('version')} is unknown",
+            got=f"{version:g}",
+            expected=f"{EPISODE_VERSION}",
+            remedy="update torchcloth",
         )
 
 
-def _needed(root: Fields, key: str) -> Fields:
-    return Fields(root.take(key), root.at(key))
+def _require_group(root: Fields, key: str) -> Fields:
+    return Fields(root.take(key), root.location(key))
 
 
 def _provenance(root: Fields) -> str:
@@ -151,18 +172,18 @@ def _provenance(root: Fields) -> str:
     if got != "measured" and not got.startswith("synthetic: "):
         expected = "'measured' or 'synthetic: <generator>'"
         raise RecordingError(
-            f"{root.at('provenance')} is unclear", got=repr(got), expected=expected, remedy="say where it is from"
+            f"{root.location('provenance')} is unclear", got=repr(got), expected=expected, remedy="say where it is from"
         )
     return got
 
 
 def _split(root: Fields) -> dict:
-    split = root.inside("split")
-    known = {key: split.maybe(split.text, key) for key in ("motion", "replicate_of")}
-    return {**{key: value for key, value in known.items() if value is not None}, **split.left()}
+    split = root.group("split")
+    known = {key: split.optional(split.text, key) for key in ("motion", "replicate_of")}
+    return {**{key: value for key, value in known.items() if value is not None}, **split.unknown_keys()}
 
 
-def _check_cloth(recording: Recording, told: str) -> None:
+def _check_cloth(recording: Recording, file: str) -> None:
     cloth, box = recording.cloth, recording.cloth.pattern_box()
     if cloth.sheet is None or cloth.uv is None or box is None:
         return
@@ -170,46 +191,46 @@ def _check_cloth(recording: Recording, told: str) -> None:
     if not np.allclose(got, cloth.sheet, rtol=0.01):
         expected = f"{list(cloth.sheet)}"
         raise RecordingError(
-            f"{told}: cloth.sheet is not the mesh",
+            f"{file}: cloth.sheet is not the mesh",
             got=f"a mesh of {got.tolist()}",
             expected=expected,
             remedy="drop one",
         )
 
 
-def _check_grasp(recording: Recording, name: str, told: str, folder: Folder) -> None:
-    """A grasp needs a gripper that moves and material to hold; ``told`` is the file that names it."""
-    place = f"{told}: grasps.{name}"
+def _check_grasp(recording: Recording, name: str, file: str, folder: Folder) -> None:
+    """A grasp needs a gripper that moves and material to hold; ``file`` is the file that names it."""
+    place = f"{file}: grasps.{name}"
     if name not in recording.grippers and name not in recording.joints:
         got = sorted({*recording.grippers, *recording.joints})
         raise RecordingError(
             f"{place} has no motion",
             got=got,
-            expected=f"{name}/t in {streams.MOTION}",
+            expected=f"{name}/t in {streams.MOTION_FILE}",
             remedy="rename or record it, or leave the grasp out; in a scene, say in source what moves it",
         )
     arm = recording.joints.get(name)
     if arm is not None and arm.closed is None and arm.width is None:
         raise RecordingError(
-            f"{folder.place(streams.MOTION)}: {name}/closed is missing", expected="closed or width [K]"
+            f"{folder.location(streams.MOTION_FILE)}: {name}/closed is missing", expected="closed or width [K]"
         )
     grasp = recording.grasps[name]
     if grasp.uv is None:
-        _check_held_vertices(recording, grasp, place)
+        _check_grasped_vertices(recording, grasp, place)
     else:
-        _check_held_pattern(recording, grasp.uv, grasp.radius, place)
+        _check_grasped_pattern(recording, grasp.uv, grasp.radius, place)
 
 
-def _check_held_vertices(recording: Recording, grasp: GraspInfo, place: str) -> None:
-    mesh, held = recording.cloth.vertices, grasp.vertices
-    if mesh is None or held is None:
+def _check_grasped_vertices(recording: Recording, grasp: GraspInfo, place: str) -> None:
+    mesh, vertices = recording.cloth.vertices, grasp.vertices
+    if mesh is None or vertices is None:
         raise RecordingError(f"{place} has no vertices to hold", expected="cloth.mesh, and vertices or uv")
-    if not len(held) or held.min() < 0 or held.max() >= len(mesh):
-        got, expected = f"vertices {held.tolist()}", f"indices in 0 to {len(mesh) - 1}"
+    if not len(vertices) or vertices.min() < 0 or vertices.max() >= len(mesh):
+        got, expected = f"vertices {vertices.tolist()}", f"indices in 0 to {len(mesh) - 1}"
         raise RecordingError(f"{place} holds nothing", got=got, expected=expected, remedy="count vertices from 0")
 
 
-def _check_held_pattern(recording: Recording, uv: np.ndarray, radius: float, place: str) -> None:
+def _check_grasped_pattern(recording: Recording, uv: np.ndarray, radius: float, place: str) -> None:
     box = recording.cloth.pattern_box()
     if box is None:
         raise RecordingError(
@@ -232,21 +253,21 @@ def _check_held_pattern(recording: Recording, uv: np.ndarray, radius: float, pla
             )
 
 
-def _check_robots(recording: Recording, told: str, folder: Folder) -> None:
+def _check_robots(recording: Recording, file: str, folder: Folder) -> None:
     for name, robot in recording.robots.items():
         if name not in recording.joints and name not in recording.grippers:
             got = sorted({*recording.grippers, *recording.joints})
-            raise RecordingError(f"{told}: robots.{name} is an unknown arm", got=got, expected="a name in motion.npz")
+            raise RecordingError(f"{file}: robots.{name} is an unknown arm", got=got, expected="a name in motion.npz")
         arm = recording.joints.get(name)
         if (
             arm is not None
             and robot.model.startswith("rizon")
             and not robot.model.endswith(".urdf")
-            and arm.q.shape[1] != RIZON_JOINTS
+            and arm.q.shape[1] != RIZON_JOINT_COUNT
         ):
-            place = f"{folder.place(streams.MOTION)}: {name}/q"
+            place = f"{folder.location(streams.MOTION_FILE)}: {name}/q"
             raise RecordingError(
-                f"{place} is not a {robot.model}'s", got=list(arm.q.shape), expected=f"[K, {RIZON_JOINTS}]"
+                f"{place} is not a {robot.model}'s", got=list(arm.q.shape), expected=f"[K, {RIZON_JOINT_COUNT}]"
             )
 
 
@@ -254,23 +275,27 @@ def _check_markers(recording: Recording, folder: Folder) -> None:
     box = recording.cloth.pattern_box()
     if recording.markers is None or recording.markers.uv is None or box is None:
         return
-    uv, slack = recording.markers.uv, MARKER_SLACK * float((box[1] - box[0]).max())
+    uv, slack = recording.markers.uv, MARKER_UV_TOLERANCE * float((box[1] - box[0]).max())
     outside = ((uv < box[0] - slack) | (uv > box[1] + slack)).any(axis=1)
     if outside.any():
         got = uv[outside][0].tolist()
         expected = f"within {box[0].tolist()} to {box[1].tolist()}"
-        raise RecordingError(f"{folder.place(streams.MARKERS)}: uv is not on the cloth", got=got, expected=expected)
+        raise RecordingError(
+            f"{folder.location(streams.MARKERS_FILE)}: uv is not on the cloth", got=got, expected=expected
+        )
 
 
 def _check_overlap(recording: Recording, folder: Folder) -> None:
-    """What was seen and what moved must share some time, on the motion clock."""
+    """Observations and motion must share some time, on the motion clock."""
     offset = recording.clock_offset
-    seen = {streams.POINTS: recording.points, streams.MARKERS: recording.markers}
-    spans = [(folder.place(file), s.t[0] + offset, s.t[-1] + offset) for file, s in seen.items() if s is not None]
+    seen = {streams.POINTS_FILE: recording.points, streams.MARKERS_FILE: recording.markers}
+    spans = [(folder.location(file), s.t[0] + offset, s.t[-1] + offset) for file, s in seen.items() if s is not None]
     if recording.truth is not None:
-        spans.append((folder.place(streams.TRUTH), recording.truth.t[0], recording.truth.t[-1]))
+        spans.append((folder.location(streams.TRUTH_FILE), recording.truth.t[0], recording.truth.t[-1]))
         if recording.provenance == "measured":
-            raise RecordingError(f"{folder.place(streams.TRUTH)} is in a measured episode", expected="a synthetic one")
+            raise RecordingError(
+                f"{folder.location(streams.TRUTH_FILE)} is in a measured episode", expected="a synthetic one"
+            )
     times = [m.t for m in (*recording.grippers.values(), *recording.joints.values())]
     if not times:
         return
@@ -285,28 +310,29 @@ def _check_overlap(recording: Recording, folder: Folder) -> None:
 
 
 def _check_seconds(recording: Recording, folder: Folder) -> None:
-    """Streams of one motion last about as long: one that ticks more slowly than another lasts is in another unit.
+    """Refuse streams that are obviously in milliseconds.
 
-    So are all of them where the cloth was seen more slowly than any camera sees.
+    Streams of one motion last about as long: if one has longer intervals than another lasts, it is in another unit. So
+    are all of them if the cloth was seen more rarely than by any camera.
     """
     motions = {**recording.grippers, **recording.joints}
-    times = {f"{folder.place(streams.MOTION)}: {name}/t": motion.t for name, motion in motions.items()}
-    seen = {streams.POINTS: recording.points, streams.MARKERS: recording.markers}
-    times |= {f"{folder.place(file)}: t": stream.t for file, stream in seen.items() if stream is not None}
+    times = {f"{folder.location(streams.MOTION_FILE)}: {name}/t": motion.t for name, motion in motions.items()}
+    seen = {streams.POINTS_FILE: recording.points, streams.MARKERS_FILE: recording.markers}
+    times |= {f"{folder.location(file)}: t": stream.t for file, stream in seen.items() if stream is not None}
     spans = {place: float(t[-1] - t[0]) for place, t in times.items() if len(t) > 1}
     for file, stream in seen.items():
-        step = 0.0 if stream is None or len(stream.t) < FEW_TICKS else float(np.median(np.diff(stream.t)))
-        if step > SLOWEST:
-            place, got = f"{folder.place(file)}: t", f"steps of {step:.4g}"
+        step = 0.0 if stream is None or len(stream.t) < MIN_TIMED_FRAMES else float(np.median(np.diff(stream.t)))
+        if step > MAX_FRAME_INTERVAL_S:
+            place, got = f"{folder.location(file)}: t", f"steps of {step:.4g}"
             raise RecordingError(f"{place} looks like milliseconds", got=got, expected="seconds", remedy="rescale it")
-    lasting = {place: span for place, span in spans.items() if len(times[place]) >= FEW_TICKS}
-    brief = min(lasting, key=lasting.__getitem__, default="")
+    long_spans = {place: span for place, span in spans.items() if len(times[place]) >= MIN_TIMED_FRAMES}
+    shortest = min(long_spans, key=long_spans.__getitem__, default="")
     for place, span in spans.items():
         step = float(np.median(np.diff(times[place])))
-        if len(times[place]) >= FEW_TICKS and span > FAR_LONGER * spans[brief] and step > spans[brief]:
+        if len(times[place]) >= MIN_TIMED_FRAMES and span > MAX_SPAN_RATIO * spans[shortest] and step > spans[shortest]:
             raise RecordingError(
                 f"{place} looks like milliseconds",
-                got=f"steps of {step:.4g}, while {brief} spans {spans[brief]:.4g}",
+                got=f"steps of {step:.4g}, while {shortest} spans {spans[shortest]:.4g}",
                 expected="seconds",
                 remedy="rescale it",
             )

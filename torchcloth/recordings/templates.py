@@ -1,4 +1,4 @@
-"""Episodes that nobody has done yet: scene, first shape and motion, for a robot to carry out and record."""
+"""Episode templates: scene, first shape and motion, for a robot to execute and record."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ from ..errors import TorchclothError
 from .reading import read
 from .types import Recording
 
-FILES = frozenset(("episode.json", "motion.npz", "cloth.obj", "cloth_initial.npy"))  # while nothing is recorded
+TEMPLATE_FILES = frozenset(("episode.json", "motion.npz", "cloth.obj", "cloth_initial.npy"))
 
 
-def undone(recording: Recording, provenance: str) -> Recording:
-    """Without all that was seen and felt."""
+def as_template(recording: Recording, provenance: str) -> Recording:
+    """Return the episode without any observation or force."""
     return replace(
         recording,
         grippers={name: replace(g, force=None, torque=None) for name, g in recording.grippers.items()},
@@ -26,13 +26,15 @@ def undone(recording: Recording, provenance: str) -> Recording:
     )
 
 
-def is_undone(folder: Path, provenance: str) -> bool:
-    """Written with this provenance, and nothing recorded into it since."""
-    if folder.is_symlink() or not folder.is_dir() or not {path.name for path in folder.iterdir()} <= FILES:
+def is_template(folder: Path, provenance: str) -> bool:
+    """Return whether a folder was written with this provenance and nothing has been recorded into it since."""
+    if folder.is_symlink() or not folder.is_dir() or not {path.name for path in folder.iterdir()} <= TEMPLATE_FILES:
         return False
     try:
-        found = read(folder)
+        recording = read(folder)
     except TorchclothError:
         return False
-    felt = [g.force is not None or g.torque is not None for g in (*found.grippers.values(), *found.joints.values())]
-    return found.provenance == provenance and not any(felt)
+    has_forces = [
+        g.force is not None or g.torque is not None for g in (*recording.grippers.values(), *recording.joints.values())
+    ]
+    return recording.provenance == provenance and not any(has_forces)

@@ -21,13 +21,13 @@ import numpy as np
 
 from ..errors import RecordingError
 from . import checks
-from .atomic_write import place
+from .atomic_write import write_folder_atomically
 from .files import Folder
 
-FORMAT, VERSION = "torchcloth-tension", 1
-META, ROWS = "table.json", "table.csv"
-LONGEST = 5.0  # m, of a specimen; the same number in millimetres is a loop of yarn
-LARGEST_STRAIN = 5.0  # beyond which displacements are plainly not in the length's unit
+TENSION_FORMAT, TENSION_VERSION = "torchcloth-tension", 1
+TENSION_TABLE_FILE, TENSION_ROWS_FILE = "table.json", "table.csv"
+MAX_SPECIMEN_LENGTH_M = 5.0  # the same number in millimetres is a loop of yarn
+MAX_STRAIN = 5.0  # above it, displacements are not in the unit of the length
 _COLUMNS = ("repeat", "displacement", "force", "lateral_strain")
 
 
@@ -35,21 +35,35 @@ _COLUMNS = ("repeat", "displacement", "force", "lateral_strain")
 class ForceDisplacement:
     """Readings of one kind of specimen, pulled once or several times.
 
-    ``displacement`` counts from the first reading, where the specimen already carries ``preload``; with gauge marks it
-    is their change of distance, and ``length`` their distance.
+    ``displacement`` counts from the first reading, at which the specimen already carries ``preload``. With gauge marks
+    it is their change of distance, and ``length`` is their distance.
+
+    Attributes:
+        length: m, between the clamps or marks at the first reading.
+        width: m, of cloth that carries the force.
+        angle: rad, from the warp to the direction of pull.
+        displacement: [N] m.
+        force: [N] N.
+        lateral_strain: [N], change of width over width, NaN where not seen.
+        repeat: [N] int, which pull a row belongs to; None: there is one.
+        preload: N, at displacement 0.
+        provenance: "measured" or "synthetic: <generator>".
+        licence: of the data.
+        path: where it was read from; None while only in memory.
+        extra: further keys of table.json.
     """
 
-    length: float  # m, between the clamps or marks at the first reading
-    width: float  # m of cloth that carries the force
-    angle: float  # rad, from the warp to the direction of pull
-    displacement: np.ndarray  # [N] m
-    force: np.ndarray  # [N] N
-    lateral_strain: np.ndarray | None = None  # [N] -, change of width over width, NaN where not seen
-    repeat: np.ndarray | None = None  # [N] int, which pull a row belongs to; None: one
-    preload: float = 0.0  # N, at displacement 0
+    length: float
+    width: float
+    angle: float
+    displacement: np.ndarray
+    force: np.ndarray
+    lateral_strain: np.ndarray | None = None
+    repeat: np.ndarray | None = None
+    preload: float = 0.0
     provenance: str = "measured"
     licence: str | None = None
-    path: Path | None = None  # where it was read from; None while only in memory
+    path: Path | None = None
     extra: dict[str, Any] = field(default_factory=dict)
 
     def __len__(self) -> int:
@@ -57,80 +71,82 @@ class ForceDisplacement:
 
     @property
     def strain(self) -> np.ndarray:
-        """[N] -, displacement over length."""
+        """Strain [N], displacement over length."""
         return self.displacement / self.length
 
-    def rows(self, chosen: np.ndarray) -> ForceDisplacement:
-        """The table with the chosen rows only, by mask or index."""
+    def select_rows(self, chosen: np.ndarray) -> ForceDisplacement:
+        """Return the table with the chosen rows only, by mask or index."""
         picked = {key: value[chosen] for key, value in _arrays(self).items()}
         return ForceDisplacement(**{**_scalars(self), **picked, "path": self.path, "extra": self.extra})
 
-    def repeats(self, *numbers: int) -> ForceDisplacement:
-        """The table with some of its pulls only."""
-        own = np.zeros(len(self), dtype=int) if self.repeat is None else self.repeat
-        return self.rows(np.isin(own, numbers))
+    def select_repeats(self, *numbers: int) -> ForceDisplacement:
+        """Return the table with some of its pulls only."""
+        repeat = np.zeros(len(self), dtype=int) if self.repeat is None else self.repeat
+        return self.select_rows(np.isin(repeat, numbers))
 
 
 def read_tension(path: str | Path) -> ForceDisplacement:
     """Read a table folder.
 
     Raises:
-        RecordingError: a file is missing, damaged, or not in SI units; one line says what, got, expected, remedy.
+        RecordingError: a file is missing, damaged, or not in SI units.
     """
     return _read(Folder(Path(path)))
 
 
 def write_tension(table: ForceDisplacement, path: str | Path, *, overwrite: bool = False) -> Path:
-    """Write a table folder atomically; what cannot be read back is refused.
+    """Write a table folder atomically; a table that cannot be read back is refused.
 
     Raises:
-        RecordingError: the target exists, or the table would be refused by `read_tension`, or the disk fails.
+        RecordingError: the target exists, or the table would be refused by ``read_tension``, or the disk fails.
     """
 
     def fill(part: Path, shown: Path) -> None:
-        meta = {"format": FORMAT, "version": VERSION, **_scalars(table), **table.extra}
-        (part / META).write_text(json.dumps(meta, indent=1, allow_nan=False) + "\n", encoding="utf-8")
+        meta = {"format": TENSION_FORMAT, "version": TENSION_VERSION, **_scalars(table), **table.extra}
+        (part / TENSION_TABLE_FILE).write_text(json.dumps(meta, indent=1, allow_nan=False) + "\n", encoding="utf-8")
         columns = _arrays(table)
-        with (part / ROWS).open("w", encoding="utf-8", newline="") as file:
+        with (part / TENSION_ROWS_FILE).open("w", encoding="utf-8", newline="") as file:
             writer = csv.writer(file)
             writer.writerow(columns)
             cells = zip(*(np.asarray(c).tolist() for c in columns.values()), strict=True)
             writer.writerows([["" if cell != cell else repr(cell) for cell in row] for row in cells])
-        _read(Folder(part, shown=shown))
+        _read(Folder(part, display_path=shown))
 
-    return place(Path(path), fill, marker=META, overwrite=overwrite)
+    return write_folder_atomically(Path(path), fill, marker=TENSION_TABLE_FILE, overwrite=overwrite)
 
 
 def _read(folder: Folder) -> ForceDisplacement:
-    meta = folder.json(META)
-    found = meta.text("format"), meta.number("version")
-    if found != (FORMAT, VERSION):
-        raise RecordingError(f"{meta.place} is another format", got=found, expected=f"{FORMAT} {VERSION}")
-    columns = _columns(folder.text(ROWS), folder.place(ROWS))
+    meta = folder.read_json(TENSION_TABLE_FILE)
+    identity = meta.text("format"), meta.number("version")
+    if identity != (TENSION_FORMAT, TENSION_VERSION):
+        raise RecordingError(
+            f"{meta.place} is another format", got=identity, expected=f"{TENSION_FORMAT} {TENSION_VERSION}"
+        )
+    columns = _columns(folder.read_text(TENSION_ROWS_FILE), folder.location(TENSION_ROWS_FILE))
     table = ForceDisplacement(
-        length=meta.number("length", above=0, most=LONGEST, suspect="millimetres"),
-        width=meta.number("width", above=0, most=LONGEST, suspect="millimetres"),
-        angle=meta.number("angle", least=-np.pi, most=np.pi, suspect="degrees"),
-        preload=meta.maybe(meta.number, "preload", least=0.0) or 0.0,
+        length=meta.number("length", above=0, maximum=MAX_SPECIMEN_LENGTH_M, suspect="millimetres"),
+        width=meta.number("width", above=0, maximum=MAX_SPECIMEN_LENGTH_M, suspect="millimetres"),
+        angle=meta.number("angle", minimum=-np.pi, maximum=np.pi, suspect="degrees"),
+        preload=meta.optional(meta.number, "preload", minimum=0.0) or 0.0,
         provenance=meta.text("provenance"),
-        licence=meta.maybe(meta.text, "licence"),
-        path=folder.shown,
-        extra=meta.left(),
+        licence=meta.optional(meta.text, "licence"),
+        path=folder.display_path,
+        extra=meta.unknown_keys(),
         **columns,
     )
     if not np.any(table.force):
         raise RecordingError(
-            f"{folder.place(ROWS)}: force",
+            f"{folder.location(TENSION_ROWS_FILE)}: force",
             got="0 in every row",
             expected="forces",
             remedy="was the load cell connected?",
         )
     worst = float(np.abs(table.strain).max())
-    if worst > LARGEST_STRAIN:
+    if worst > MAX_STRAIN:
         raise RecordingError(
-            f"{folder.place(ROWS)}: displacement looks like millimetres",
+            f"{folder.location(TENSION_ROWS_FILE)}: displacement looks like millimetres",
             got=f"a strain of {worst:.3g}",
-            expected=f"at most {LARGEST_STRAIN:g}",
+            expected=f"at most {MAX_STRAIN:g}",
             remedy="use metres",
         )
     return table
@@ -157,7 +173,7 @@ def _columns(text: str, place: str) -> dict[str, np.ndarray]:
             numbers = np.array([float(c) if c or not unseen else np.nan for c in cells])
         except ValueError as error:
             raise RecordingError(f"{place}: {name} is not numbers", got=error, remedy="repair that row") from None
-        out[name] = checks.array(numbers, f"{place}: {name}", (len(body),), nan=unseen)
+        out[name] = checks.check_array(numbers, f"{place}: {name}", (len(body),), nan=unseen)
     if "repeat" in out:
         if (out["repeat"] != np.round(out["repeat"])).any():
             raise RecordingError(f"{place}: repeat is not whole", expected="0, 1, 2, ...")
@@ -166,11 +182,11 @@ def _columns(text: str, place: str) -> dict[str, np.ndarray]:
 
 
 def _scalars(table: ForceDisplacement) -> dict[str, Any]:
-    """What table.json holds beside the format and the extras."""
+    """Content of table.json besides the format and the extra keys."""
     keys = ("length", "width", "angle", "preload", "provenance", "licence")
     return {key: getattr(table, key) for key in keys if getattr(table, key) is not None}
 
 
 def _arrays(table: ForceDisplacement) -> dict[str, np.ndarray]:
-    """Columns that are there, in the file's order."""
+    """Columns that are present, in the file's order."""
     return {key: np.asarray(getattr(table, key)) for key in _COLUMNS if getattr(table, key) is not None}

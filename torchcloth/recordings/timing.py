@@ -1,4 +1,4 @@
-"""When each stream of an episode ticks."""
+"""Timing of the streams of an episode."""
 
 from __future__ import annotations
 
@@ -8,21 +8,22 @@ import numpy as np
 
 from .types import Recording
 
-SLOWEST = 3.0  # s between frames of what moves: 240 Hz in milliseconds are 4
-GAP = 1.5  # an interval longer than so many usual ones is a gap
+MAX_FRAME_INTERVAL_S = 3.0  # between frames of a moving scene; 240 Hz in milliseconds are 4
+GAP_FACTOR = 1.5  # a gap is longer than so many median intervals
 
 
 @dataclass(frozen=True)
-class Stream:
-    """The times of one stream, in s on its own clock.
+class StreamTiming:
+    """Timing of one stream, in s on its own clock.
 
     Attributes:
         kind: "motion", "joints", "points", "markers", "depth", "color" or "mask".
-        frames: how many.
-        start, span: first time, and from there to the last.
+        frames: number of frames.
+        start: time of the first frame.
+        span: time from the first to the last frame.
         rate: Hz, intervals per span.
         largest_gap: the longest interval.
-        gaps: how many intervals are longer than 1.5 usual (median) ones.
+        gaps: number of intervals that are longer than 1.5 median ones.
         jitter: standard deviation of the intervals.
     """
 
@@ -36,29 +37,34 @@ class Stream:
     jitter: float
 
 
-def times(recording: Recording) -> dict[str, tuple[str, np.ndarray]]:
-    """Kind and times [T] s of every stream by name; motion runs on the motion clock, all else on the observation's."""
-    found: dict[str, tuple[str, np.ndarray]] = {}
+def stream_times(recording: Recording) -> dict[str, tuple[str, np.ndarray]]:
+    """Return kind and times [T] s of every stream by name.
+
+    Motion runs on the motion clock, all other streams on that of the observation.
+    """
+    streams: dict[str, tuple[str, np.ndarray]] = {}
     for name in sorted({*recording.grippers, *recording.joints}):
         motion = recording.joints.get(name) or recording.grippers[name]
         kinds = [kind for kind, bag in (("motion", recording.grippers), ("joints", recording.joints)) if name in bag]
-        found[name] = (" + ".join(kinds), motion.t)
+        streams[name] = (" + ".join(kinds), motion.t)
     for kind in ("points", "markers"):
         if (stream := getattr(recording, kind)) is not None:
-            found[kind] = (kind, stream.t)
+            streams[kind] = (kind, stream.t)
     for name, camera in recording.cameras.items():
         for kind in ("depth", "color", "mask"):
             if (images := getattr(camera, kind)) is not None:
-                found[f"{name}/{kind}"] = (kind, images.t)
-    return found
+                streams[f"{name}/{kind}"] = (kind, images.t)
+    return streams
 
 
-def ticks(kind: str, t: np.ndarray) -> Stream:
-    """How a stream ticks."""
+def summarise_timing(kind: str, t: np.ndarray) -> StreamTiming:
+    """Return the timing of a stream with times ``t`` [T] s."""
     between = np.diff(t)
     span = float(t[-1] - t[0])
     if len(between) == 0:
-        return Stream(kind, len(t), float(t[0]), 0.0, 0.0, 0.0, 0, 0.0)
-    late = between > GAP * np.median(between)
+        return StreamTiming(kind, len(t), float(t[0]), 0.0, 0.0, 0.0, 0, 0.0)
+    late = between > GAP_FACTOR * np.median(between)
     rate = len(between) / span
-    return Stream(kind, len(t), float(t[0]), span, rate, float(between.max()), int(late.sum()), float(between.std()))
+    return StreamTiming(
+        kind, len(t), float(t[0]), span, rate, float(between.max()), int(late.sum()), float(between.std())
+    )

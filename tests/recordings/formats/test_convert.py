@@ -15,17 +15,17 @@ def call(*arguments) -> int:
 
 
 def test_the_choices_are_the_formats():
-    assert set(convert.FORMATS) == set(formats.NAMES)
+    assert set(convert.FORMATS) == set(formats.FORMAT_NAMES)
 
 
 def test_a_folder_becomes_an_episode_and_the_episode_mcap(tmp_path, capsys):
     truth = foreign_formats.tum(tmp_path)
     scene, episode, bag = truth.write_scene(), tmp_path / "ep", tmp_path / "ep.mcap"
     assert call(truth.path, episode, "--scene", scene, "--from", "tum") == 0
-    said = capsys.readouterr().out
-    assert "cam0/depth" in said
-    assert "16 x 12 px" in said
-    assert "30.0" in said
+    message = capsys.readouterr().out
+    assert "cam0/depth" in message
+    assert "16 x 12 px" in message
+    assert "30.0" in message
     assert call(episode, bag) == 0
     assert call(bag, tmp_path / "back") == 0
     images = [rec.read(p).cameras["cam0"].color for p in (episode, tmp_path / "back")]
@@ -37,16 +37,16 @@ def test_a_refusal_is_one_line_and_leaves_nothing(tmp_path, capsys):
     out = tmp_path / "out" / "ep"
     scene = truth.write_scene()
     for arguments, match in (
-        ([], "does not tell everything"),
+        ([], "does not contain everything"),
         (["--scene", scene, "--from", "redwood"], "mislabelled; got content of tum; expected redwood"),
         (["--scene", tmp_path / "lost.json"], "lost.json is missing"),
         (["--scene", scene, "--episode", "3"], "holds one episode"),
     ):
         assert call(truth.path, out, *arguments) == 2
-        said = capsys.readouterr().err
-        assert said.startswith("torchcloth: ")
-        assert said.count("\n") == 1
-        assert match in said
+        message = capsys.readouterr().err
+        assert message.startswith("torchcloth: ")
+        assert message.count("\n") == 1
+        assert match in message
     image = sorted((truth.path / "depth").iterdir())[2]
     image.write_bytes(image.read_bytes()[:-20])
     assert call(truth.path, out, "--scene", scene) == 2

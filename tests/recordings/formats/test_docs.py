@@ -4,12 +4,9 @@ from __future__ import annotations
 
 import json
 import re
-import sys
 from pathlib import Path
 
 import numpy as np
-
-
 from helpers import foreign_formats
 
 import torchcloth as tc
@@ -34,7 +31,7 @@ def test_the_episode_can_be_read(tmp_path):
     assert not recording.extra
     assert recording.cloth.sheet == (0.3, 0.3)
     np.testing.assert_array_equal(recording.cameras["cam0"].distortion, [0.2624, -0.9531, -0.0054, 0.0026, 1.1633])
-    sidecar_schema.check(json.loads(text), "docs/reference/episode.md")
+    sidecar_schema.check_keys(json.loads(text), "docs/reference/episode.md")
 
 
 def test_an_arm_of_ones_own(tmp_path, monkeypatch):
@@ -43,10 +40,10 @@ def test_an_arm_of_ones_own(tmp_path, monkeypatch):
     urdf = Path(tc.robots.__file__).parent / "urdf" / "rizon4.urdf"
     (tmp_path / "my.urdf").write_text(urdf.read_text().replace('"tcp_closed"', '"tip"'))
     monkeypatch.setattr(tc.robots, "plan", lambda rig, action: (rig, action))
-    (text,) = blocks("reference/episode.md", "python")
-    own = {}
-    exec(compile(text, "docs/reference/episode.md", "exec"), own)
-    rig, action = own["plan"]
+    (text,) = blocks("how-to/own-arm.md", "python")
+    custom = {}
+    exec(compile(text, "docs/how-to/own-arm.md", "exec"), custom)
+    rig, action = custom["plan"]
     assert rig["hand"].frame == "tip"
     assert set(action.motion) == {"hand"}
 
@@ -54,17 +51,17 @@ def test_an_arm_of_ones_own(tmp_path, monkeypatch):
 def test_every_word_is_explained():
     page = (DOCS / "reference" / "episode.md").read_text()
     every = [
-        sidecar_schema.SCENE,
-        *sidecar_schema.OBJECTS.values(),
-        *sidecar_schema.GROUPS.values(),
-        sidecar_schema.PLANE,
+        sidecar_schema.SIDECAR_KEYS,
+        *sidecar_schema.OBJECT_KEYS.values(),
+        *sidecar_schema.NAMED_GROUP_KEYS.values(),
+        sidecar_schema.PLANE_KEYS,
     ]
     assert not [word for group in every for word in group if word != "source" and word not in page]
 
 
 def test_the_scenes(tmp_path):
     tum, ros2 = blocks("how-to/import-recordings.md", "json")
-    sidecar_schema.check(json.loads(ros2), "docs/how-to/import-recordings.md")
+    sidecar_schema.check_keys(json.loads(ros2), "docs/how-to/import-recordings.md")
     truth = foreign_formats.tum(tmp_path)
     (truth.path / "groundtruth.txt").unlink()
     truth.scene = json.loads(tum)
@@ -84,10 +81,10 @@ def test_depth_images_become_points(tmp_path, monkeypatch):
     (images.parent / "timestamps.csv").write_text("frame,t_color,t_depth\n0,,0.0\n1,,0.5\n")
     matrix = [[140.0, 0, 79.5], [0, 140.0, 59.5], [0, 0, 1]]
     size = {"width": 160, "height": 120, "depth_scale": 0.001}
-    told = {**foreign_formats.KNOWN, "format": "torchcloth-recording", "version": 1}
-    told["cloth"] = told["cloth"] | {"sheet": {"width": 0.2, "height": 0.2}}
-    told["cameras"] = {"cam0": {**size, "K": matrix, "T_world_camera": pose.tolist()}}
-    (tmp_path / "my_episode" / "episode.json").write_text(json.dumps(told))
+    message = {**foreign_formats.KNOWN, "format": "torchcloth-recording", "version": 1}
+    message["cloth"] = message["cloth"] | {"sheet": {"width": 0.2, "height": 0.2}}
+    message["cameras"] = {"cam0": {**size, "K": matrix, "T_world_camera": pose.tolist()}}
+    (tmp_path / "my_episode" / "episode.json").write_text(json.dumps(message))
     cut_out, laid_on = blocks("how-to/import-recordings.md", "python")
     exec(compile(cut_out, "docs/how-to/import-recordings.md", "exec"), {})
     points = rec.read("my_episode_points").require("points")

@@ -53,22 +53,22 @@ def content(recording: rec.Recording) -> Content:
     return Content({k: v for k, v in numbers.items() if isinstance(v, np.ndarray)}, images)
 
 
-def wrong_parts(found: Content, truth: Content) -> list[str]:
+def wrong_parts(result: Content, truth: Content) -> list[str]:
     """The names of what differs; a part that is there in one only, or of another length, is "structure"."""
-    if found.numbers.keys() != truth.numbers.keys() or found.images.keys() != truth.images.keys():
+    if result.numbers.keys() != truth.numbers.keys() or result.images.keys() != truth.images.keys():
         return ["structure"]
     wrong = []
     for key, expected in truth.numbers.items():
-        if found.numbers[key].shape != expected.shape:
+        if result.numbers[key].shape != expected.shape:
             return ["structure"]
-        if not np.array_equal(found.numbers[key], expected):
+        if not np.array_equal(result.numbers[key], expected):
             wrong.append(key)
     for key, images in truth.images.items():
-        if len(found.images[key]) != len(images):
+        if len(result.images[key]) != len(images):
             return ["structure"]
         wrong += [
             f"{key}[{i}]"
-            for i, (a, b) in enumerate(zip(found.images[key], images, strict=True))
+            for i, (a, b) in enumerate(zip(result.images[key], images, strict=True))
             if not np.array_equal(a, b)
         ]
     return wrong
@@ -110,9 +110,9 @@ def mutate(rng: random.Random, files: list[Path]) -> tuple[str, set[Path]]:
         data = bytearray(rng.choice([b"{}", b"[]", b"1 2 3\n", b"\x00" * 50, b"null"]))
     touched = {file}
     if how == "swap" and other != file:
-        kept = other.read_bytes()
+        remaining = other.read_bytes()
         other.write_bytes(bytes(data))
-        file.write_bytes(kept)
+        file.write_bytes(remaining)
         touched.add(other)
     elif how == "rename":
         suffix = rng.choice([file.suffix, ".txt", ".png", ".mkv"])
@@ -139,9 +139,9 @@ def attempt(truth: foreign_formats.Foreign, scene: Path, out: Path) -> Content |
         assert not out.exists()
         assert not list(out.parent.glob(".*.partial"))
         return None
-    found = content(rec.read(out))
+    result = content(rec.read(out))
     shutil.rmtree(out)
-    return found
+    return result
 
 
 @pytest.fixture(autouse=True)
@@ -160,10 +160,10 @@ def fuzz(case: str, tmp_path: Path, count: int) -> Counter:
     whole = {file: file.read_bytes() for file in files_below(truth.path)}
     for i in range(count):
         how, touched = mutate(rng, list(whole))
-        found = attempt(truth, scene, out)
-        if found is None:
+        result = attempt(truth, scene, out)
+        if result is None:
             outcome["refused"] += 1
-        elif not (wrong := wrong_parts(found, expected)):
+        elif not (wrong := wrong_parts(result, expected)):
             outcome["right"] += 1
         else:
             outcome["unnoticed"] += 1

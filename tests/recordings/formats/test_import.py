@@ -14,32 +14,34 @@ LOSSY = {"lerobot": 4}  # grey levels of 255: AV1, measured 1
 
 def streams_of(recording: rec.Recording) -> dict[str, rec.ImageStream]:
     kinds = ("depth", "color", "mask")
-    found = {f"{name}/{kind}": getattr(c, kind) for name, c in recording.cameras.items() for kind in kinds}
-    return {key: stream for key, stream in found.items() if stream is not None}
+    result = {f"{name}/{kind}": getattr(c, kind) for name, c in recording.cameras.items() for kind in kinds}
+    return {key: stream for key, stream in result.items() if stream is not None}
 
 
 def arrays_of(recording: rec.Recording) -> dict[str, np.ndarray]:
     motions = [*recording.grippers.items(), *recording.joints.items()]
-    found = {f"{name}/{key}": value for name, m in motions for key, value in vars(m).items()}
+    result = {f"{name}/{key}": value for name, m in motions for key, value in vars(m).items()}
     if recording.points is not None:
-        found |= {"points/t": recording.points.t, "points/xyz": recording.points.xyz}
-    return {key: value for key, value in found.items() if isinstance(value, np.ndarray)}
+        result |= {"points/t": recording.points.t, "points/xyz": recording.points.xyz}
+    return {key: value for key, value in result.items() if isinstance(value, np.ndarray)}
 
 
 def check(recording: rec.Recording, truth: foreign_formats.Foreign, *, lossy: int = 0, points: float = 0.0) -> None:
-    found = streams_of(recording)
-    assert found.keys() == truth.images.keys()
-    for key, stream in found.items():
+    result = streams_of(recording)
+    assert result.keys() == truth.images.keys()
+    for key, stream in result.items():
         np.testing.assert_allclose(stream.t, truth.times[key], rtol=0, atol=1e-9, err_msg=key)
         assert len(stream) == len(truth.images[key])
         for i, expected in enumerate(truth.images[key]):
             pixels = stream.load(i)
             assert pixels.dtype == expected.dtype
             assert np.abs(pixels.astype(int) - expected.astype(int)).max() <= lossy, (key, i)
-    found = arrays_of(recording)
-    assert found.keys() == truth.arrays.keys()
+    result = arrays_of(recording)
+    assert result.keys() == truth.arrays.keys()
     for key, expected in truth.arrays.items():
-        np.testing.assert_allclose(found[key], expected, rtol=0, atol=points if key == "points/xyz" else 0, err_msg=key)
+        np.testing.assert_allclose(
+            result[key], expected, rtol=0, atol=points if key == "points/xyz" else 0, err_msg=key
+        )
 
 
 @pytest.mark.parametrize("name", foreign_formats.WRITERS)
@@ -53,6 +55,6 @@ def test_import_write_read(name, tmp_path):
     check(back, truth, lossy=LOSSY.get(name, 0), points=1e-7)  # float32 in the episode
     assert len(counted) == sum(map(len, truth.images.values()))
     assert back.extra["source"]["format"] == name
-    assert formats.detect(truth.path) == name
+    assert formats.detect_format(truth.path) == name
     again = formats.read(formats.write_mcap(back, tmp_path / "ep.mcap"))
     check(again, truth, lossy=LOSSY.get(name, 0), points=1e-7)

@@ -112,13 +112,13 @@ def test_a_file_of_the_mcap_project_is_read(tmp_path, name, cover):
 def test_our_checksums_are_those_of_the_mcap_project(tmp_path):
     """Sealing the file without one of its data gives the bytes of the file with it; then any change is noticed."""
     file = Path(shutil.copy(FOXGLOVE / "chunk_crcs.mcap", tmp_path))
-    mcap_checksums.seal(file)
+    mcap_checksums.write_checksums(file)
     whole = (FOXGLOVE / "all_crcs.mcap").read_bytes()
     assert file.read_bytes() == whole
     for at in range(len(whole)):
         file.write_bytes(whole[:at] + bytes([whole[at] ^ 1]) + whole[at + 1 :])
         with pytest.raises((RecordingError, struct.error)):
-            mcap_checksums.verify(file)
+            mcap_checksums.verify_checksums(file)
 
 
 def test_an_existing_file_is_kept(recording, tmp_path):

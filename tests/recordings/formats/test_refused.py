@@ -15,8 +15,8 @@ from torchcloth import recordings as rec
 from torchcloth.errors import InvalidInput, RecordingError
 from torchcloth.recordings import formats
 from torchcloth.recordings.formats import bag, lerobot
-from torchcloth.recordings.formats.bag import Message
-from torchcloth.recordings.formats.imported import nanoseconds
+from torchcloth.recordings.formats.bag import BagMessage
+from torchcloth.recordings.formats.imported import parse_nanoseconds
 from torchcloth.recordings.formats.ros2_cameras import BagImages
 
 
@@ -49,9 +49,11 @@ def refuse(truth: foreign_formats.Foreign, match: str, **options):
 @pytest.mark.parametrize("name", foreign_formats.WRITERS)
 def test_without_a_scene_it_says_what_to_write(name, copy):
     truth = copy(name)
-    kept = {key: value for key, value in truth.scene.items() if key in ("source", "cameras")}
-    truth.scene = kept
-    refuse(truth, r'does not tell everything; expected .*"cloth": \{"sheet".*"areal_density".*"provenance": "measured"')
+    remaining = {key: value for key, value in truth.scene.items() if key in ("source", "cameras")}
+    truth.scene = remaining
+    refuse(
+        truth, r'does not contain everything; expected .*"cloth": \{"sheet".*"areal_density".*"provenance": "measured"'
+    )
 
 
 @pytest.mark.parametrize("name", ["tum", "ros2", "lerobot", "kinect"])
@@ -110,10 +112,10 @@ def test_messages_that_are_not_in_the_bag_yet_are_not_lost(tmp_path, suffix):
     connection.commit()
     connection.close()
     bag._check_sqlite(file)
-    beside = tmp_path / f"take_0.db3{suffix}"
-    beside.write_bytes(b"")
+    adjacent = tmp_path / f"take_0.db3{suffix}"
+    adjacent.write_bytes(b"")
     bag._check_sqlite(file)
-    beside.write_bytes(b"more")
+    adjacent.write_bytes(b"more")
     with pytest.raises(RecordingError, match=rf"unfinished; got messages in take_0\.db3{suffix}; .*sqlite3"):
         bag._check_sqlite(file)
 
@@ -130,9 +132,9 @@ def test_a_camera_that_contradicts_the_file(copy):
 def test_a_row_major_intrinsic(copy):
     truth = copy("redwood")
     file = truth.path / "camera_intrinsic.json"
-    said = json.loads(file.read_text())
-    said["intrinsic_matrix"] = np.reshape(said["intrinsic_matrix"], (3, 3)).T.reshape(-1).tolist()
-    file.write_text(json.dumps(said))
+    message = json.loads(file.read_text())
+    message["intrinsic_matrix"] = np.reshape(message["intrinsic_matrix"], (3, 3)).T.reshape(-1).tolist()
+    file.write_text(json.dumps(message))
     refuse(truth, "is no camera matrix.*column by column")
 
 
@@ -156,10 +158,12 @@ def test_a_folder_of_open3ds_recorder(copy):
     for i, file in enumerate(sorted(truth.path.rglob("*.png"))):
         file.rename(file.with_name(f"{i % 3:05d}.png"))
     (truth.path / "camera_intrinsic.json").unlink()
-    told = o3d.t.io.RGBDVideoMetadata()
-    told.fps, told.width, told.height, told.depth_scale = 20.0, foreign_formats.WIDTH, foreign_formats.HEIGHT, 4000.0
-    told.intrinsics = o3d.camera.PinholeCameraIntrinsic(foreign_formats.WIDTH, foreign_formats.HEIGHT, 14.0, 15.0, 7.5, 5.25)
-    (truth.path / "intrinsic.json").write_text(repr(told))
+    text = o3d.t.io.RGBDVideoMetadata()
+    text.fps, text.width, text.height, text.depth_scale = 20.0, foreign_formats.WIDTH, foreign_formats.HEIGHT, 4000.0
+    text.intrinsics = o3d.camera.PinholeCameraIntrinsic(
+        foreign_formats.WIDTH, foreign_formats.HEIGHT, 14.0, 15.0, 7.5, 5.25
+    )
+    (truth.path / "intrinsic.json").write_text(repr(text))
     camera = formats.read(truth.path, scene=truth.write_scene()).cameras["cam0"]
     np.testing.assert_array_equal(camera.depth.t, [0, 0.05, 0.1])
     assert camera.depth_scale == 1 / 4000
@@ -210,16 +214,16 @@ def test_a_refused_conversion_leaves_no_folders(copy, tmp_path):
     truth = copy("tum")
     last = sorted((truth.path / "depth").iterdir())[-1]
     last.write_bytes(last.read_bytes()[:100])
-    found = formats.read(truth.path, scene=truth.write_scene())
+    result = formats.read(truth.path, scene=truth.write_scene())
     with pytest.raises(RecordingError, match="cannot be decoded"):
-        rec.write(found, tmp_path / "new" / "deep" / "ep")
+        rec.write(result, tmp_path / "new" / "deep" / "ep")
     assert not (tmp_path / "new").exists()
 
 
 @pytest.mark.parametrize("time", ["1E9999999", "nan", "yesterday"])
 def test_a_time_that_is_none(time):
     with pytest.raises(RecordingError, match="is no time"):
-        nanoseconds(time, "rgb.txt")
+        parse_nanoseconds(time, "rgb.txt")
 
 
 @pytest.mark.parametrize(("name", "file"), [("redwood", "trajectory.log"), ("tum", "groundtruth.txt")])
@@ -282,7 +286,7 @@ def test_a_depth_behind_the_lens_is_refused():
     body = SimpleNamespace(encoding="32FC1", is_bigendian=0, height=1, width=2, step=8)
     body.data = np.array([1.0, -0.5], np.float32).view(np.uint8)
     with pytest.raises(RecordingError, match=r"out of range; got -0\.5 m; expected depth >= 0"):
-        BagImages(None, "/depth", "depth")._pixels(Message("/depth", 0, body, "take: /depth"))
+        BagImages(None, "/depth", "depth")._pixels(BagMessage("/depth", 0, body, "take: /depth"))
 
 
 @pytest.mark.parametrize("what", ["pose", "wrench", "points"])
@@ -368,14 +372,14 @@ def test_lerobot_means_of_what_stands_still_are_as_wrong_as_float32_makes_them()
     """100 s of a joint at rest: every row of the sum is rounded alike."""
     values = np.full((3000, 2), [1.23, 0.1], np.float32)
     values[:, 1] += np.linspace(0, 1, 3000, dtype=np.float32)
-    kept = {f"stats/state/{name}": getattr(values, name)(axis=0).astype(float) for name in ("min", "max", "mean")}
-    off = np.abs(kept["stats/state/mean"] - values.astype(float).mean(axis=0)).max()
-    assert off > lerobot.AGREE * np.abs(values).max()
-    lerobot._agree(values.astype(float), {"file": "meta", **kept}, "state")
+    remaining = {f"stats/state/{name}": getattr(values, name)(axis=0).astype(float) for name in ("min", "max", "mean")}
+    off = np.abs(remaining["stats/state/mean"] - values.astype(float).mean(axis=0)).max()
+    assert off > lerobot.STATISTICS_TOLERANCE * np.abs(values).max()
+    lerobot._check_statistics(values.astype(float), {"file": "meta", **remaining}, "state")
     changed = values.astype(float)
     changed[1000, 0] += 3.0
     with pytest.raises(RecordingError, match="contradicts its statistics"):
-        lerobot._agree(changed, {"file": "meta", **kept}, "state")
+        lerobot._check_statistics(changed, {"file": "meta", **remaining}, "state")
 
 
 def test_another_lerobot_version(copy):

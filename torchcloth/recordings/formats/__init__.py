@@ -1,10 +1,19 @@
-"""Recordings of other formats: imported into a `Recording`, and written as MCAP.
+"""Importers of other formats, and the MCAP writer.
 
     recording = formats.read("session.mcap", scene="scene.json")
     recordings.write(recording, "episodes/ep_01")
 
-Each importer is a module with NAME, TITLE, ``matches(path)`` (by content) and ``read(path, scene, episode)``. What only
-the user knows stands in a side file in the words of episode.json; see `side`. Images are decoded when they are written.
+============================  ==========================================
+ROS 2 bags                    ``ros2`` (folders, .mcap and .db3 files)
+LeRobot v3                    ``lerobot``
+Azure Kinect .mkv             ``kinect``
+Open3D/Redwood RGB-D folders  ``redwood``
+TUM RGB-D folders             ``tum``
+============================  ==========================================
+
+Each importer is a module that defines an ``Importer``. What only
+the user knows is in a sidecar file with the keys of episode.json; see ``sidecar``. Images are decoded when they are
+written.
 """
 
 from __future__ import annotations
@@ -14,14 +23,18 @@ from pathlib import Path
 from ...errors import InvalidInput, RecordingError
 from .. import reading
 from ..types import Recording
-from . import kinect, lerobot, redwood, ros2, tum
+from .kinect import KINECT_IMPORTER
+from .lerobot import LEROBOT_IMPORTER, LEROBOT_NAME
 from .mcap_writer import write as write_mcap
-from .sidecar import Scene
+from .redwood import REDWOOD_IMPORTER
+from .ros2 import ROS2_IMPORTER
+from .sidecar import Sidecar
+from .tum import TUM_IMPORTER
 
-IMPORTERS = (ros2, lerobot, redwood, tum, kinect)
-EPISODE = "episode"
-NAMES = (EPISODE, *(importer.NAME for importer in IMPORTERS))
-KNOWN = {  # files that people take for one of ours
+IMPORTERS = (ROS2_IMPORTER, LEROBOT_IMPORTER, REDWOOD_IMPORTER, TUM_IMPORTER, KINECT_IMPORTER)
+EPISODE_FOLDER_FORMAT = "episode"
+FORMAT_NAMES = (EPISODE_FOLDER_FORMAT, *(importer.name for importer in IMPORTERS))
+FOREIGN_SIGNATURES = {  # of files that are often confused with a recording
     b"PAR1": "a parquet file",
     b"\x89PNG": "a PNG image",
     b"\xff\xd8\xff": "a JPEG image",
@@ -30,11 +43,11 @@ KNOWN = {  # files that people take for one of ours
     b"\x89HDF": "an HDF5 file",
 }
 
-__all__ = ["NAMES", "Scene", "detect", "read", "write_mcap"]
+__all__ = ["FORMAT_NAMES", "Sidecar", "detect_format", "read", "write_mcap"]
 
 
-def detect(path: str | Path) -> str:
-    """The name of the format, by content.
+def detect_format(path: str | Path) -> str:
+    """Return the name of the format, by content.
 
     Raises:
         RecordingError: nothing is there, or it is of no known format.
@@ -43,17 +56,17 @@ def detect(path: str | Path) -> str:
     try:
         if not path.exists():
             raise RecordingError(f"{path} does not exist", expected="a recording", remedy="check the path")
-        if path.is_dir() and (path / reading.EPISODE).is_file():
-            return EPISODE
-        found = next((i.NAME for i in IMPORTERS if i.matches(path)), None)
+        if path.is_dir() and (path / reading.EPISODE_FILE).is_file():
+            return EPISODE_FOLDER_FORMAT
+        name = next((i.name for i in IMPORTERS if i.matches(path)), None)
     except RecordingError:
         raise
     except (OSError, ValueError) as error:
         raise RecordingError(f"{path} cannot be read", got=error, expected="a recording") from error
-    if found is None:
-        expected = ", ".join(importer.TITLE for importer in IMPORTERS) + ", or an episode folder"
+    if name is None:
+        expected = ", ".join(importer.title for importer in IMPORTERS) + ", or an episode folder"
         raise RecordingError(f"{path} is of no known format", got=_content(path), expected=expected)
-    return found
+    return name
 
 
 def read(
@@ -63,29 +76,29 @@ def read(
 
     Args:
         path: file or folder.
-        format: what it must be, one of ``NAMES``; None finds out.
-        scene: JSON file with what the recording does not tell, in the words of episode.json.
-        episode: which one, where a file holds many.
+        format: what it must be, one of ``FORMAT_NAMES``; None detects it.
+        scene: JSON file with what the recording does not contain, in the keys of episode.json.
+        episode: which one, if a file holds many.
 
     Raises:
         RecordingError: it cannot be trusted, is of another format, or the scene lacks or contradicts something.
         InvalidInput: the format is unknown.
     """
     path = Path(path)
-    if format is not None and format not in NAMES:
-        raise InvalidInput("format is unknown", got=repr(format), expected=f"one of {', '.join(NAMES)}")
-    found = detect(path)
-    if format is not None and format != found:
-        raise RecordingError(f"{path} is mislabelled", got=f"content of {found}", expected=format)
-    if episode is not None and found != lerobot.NAME:
+    if format is not None and format not in FORMAT_NAMES:
+        raise InvalidInput("format is unknown", got=repr(format), expected=f"one of {', '.join(FORMAT_NAMES)}")
+    detected = detect_format(path)
+    if format is not None and format != detected:
+        raise RecordingError(f"{path} is mislabelled", got=f"content of {detected}", expected=format)
+    if episode is not None and detected != LEROBOT_NAME:
         raise RecordingError(f"{path} holds one episode", got=f"--episode {episode}", remedy="leave it out")
-    if found == EPISODE:
+    if detected == EPISODE_FOLDER_FORMAT:
         if scene is not None:
             raise RecordingError(f"{path} is an episode", got="a scene", remedy="edit its episode.json instead")
         return reading.read(path, with_truth=True)
-    side = Scene.read(None if scene is None else Path(scene))
-    importer = next(importer for importer in IMPORTERS if found == importer.NAME)
-    return side.complete(importer.read(path, side, episode), path)
+    sidecar = Sidecar.read(None if scene is None else Path(scene))
+    importer = next(importer for importer in IMPORTERS if detected == importer.name)
+    return sidecar.complete_recording(importer.read(path, sidecar, episode), path)
 
 
 def _content(path: Path) -> str:
@@ -96,4 +109,4 @@ def _content(path: Path) -> str:
         head = file.read(12)
     if head[4:8] == b"ftyp":
         return "an MP4 video"
-    return next((what for magic, what in KNOWN.items() if head.startswith(magic)), repr(head[:8]))
+    return next((what for magic, what in FOREIGN_SIGNATURES.items() if head.startswith(magic)), repr(head[:8]))

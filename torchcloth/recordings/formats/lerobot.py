@@ -2,17 +2,18 @@
 
     meta/info.json  meta/episodes/**.parquet  data/**.parquet  videos/KEY/**.mp4
 
-One file holds many episodes: ``--episode N`` chooses one. The columns of a vector are named in info.json; what they
-mean, and in which unit, only the user knows:
+One file holds many episodes: ``--episode N`` chooses one. The columns of a vector are named in info.json. Their meaning
+and unit must be given by the user:
 
     "source": {"motion": {"left": {"column": "observation.state", "joints": ["j1.pos", ...], "unit": "rad" | "deg",
                                    "width": "gripper.width", "width_scale": 1.0, "closed": true}},
                "cameras": {"cam0": {"color": "observation.images.top"}}}
 
-Joints and width are names (of info.json) or indices. Times are those of the data set's regular clock. Checked: page
-checksums where written, one row and one video frame for every tick of that clock, and the smallest, largest and mean
-value of every column against the statistics that LeRobot keeps for each episode. Not noticed: changed bytes that
-decode to another picture, for AV1 and H.264 carry no checksum.
+Joints and width are names (of info.json) or indices. Times are those of the data set's regular clock.
+
+Checked are: page checksums if there are any; one row and one video frame for every tick of that clock; and smallest,
+largest and mean value of every column against the statistics that LeRobot stores for each episode. Changed bytes that
+decode to another picture are not detected, for AV1 and H.264 carry no checksum.
 """
 
 from __future__ import annotations
@@ -27,65 +28,82 @@ from .. import checks
 from ..checks import Fields
 from ..files import Folder
 from ..images import ImageStream
-from .imported import NANO, Imported, ImportedCamera, damaged, nothing_left
-from .sidecar import Scene
+from .imported import NANOSECONDS_PER_SECOND, Imported, ImportedCamera, Importer, reject_unknown_keys, report_damage
+from .sidecar import Sidecar
 from .video import VideoFrames
 
-NAME = "lerobot"
-TITLE = "LeRobot v3 data set"
-INFO = "meta/info.json"
-EXAMPLE = '"source": {"motion": {"left": {"column": "observation.state", "joints": [0, 1, 2], "unit": "rad"}}}'
-UNCHECKED = "pixels"
-TOLERANCE = 1e-4  # s; LeRobot's own for video and row times
-LONGEST = 1e6  # s of video in one file
-AGREE = 1e-5  # relative; statistics are kept in float64 of float32 values
-ROUNDING = 2.0**-24  # of a float32 sum with each row: means are taken of such sums, and what stands still errs alike
+LEROBOT_NAME = "lerobot"
+LEROBOT_TITLE = "LeRobot v3 data set"
+INFO_FILE = "meta/info.json"
+LEROBOT_SOURCE_EXAMPLE = (
+    '"source": {"motion": {"left": {"column": "observation.state", "joints": [0, 1, 2], "unit": "rad"}}}'
+)
+LEROBOT_UNCHECKED = "pixels"
+LEROBOT_TIME_TOLERANCE_S = 1e-4  # LeRobot's own for video and row times
+MAX_VIDEO_DURATION_S = 1e6  # of one file
+STATISTICS_TOLERANCE = 1e-5  # relative; statistics are stored in float64, values in float32
+FLOAT32_ROUNDING = 2.0**-24  # error per row of a float32 sum; means are computed from such sums
 
 
 def matches(path: Path) -> bool:
-    """Whether the folder is laid out like this."""
-    return (path / INFO).is_file()
+    """Return whether a folder has this layout."""
+    return (path / INFO_FILE).is_file()
 
 
-def read(path: Path, scene: Scene, episode: int | None) -> Imported:
-    """Read one episode; video is decoded when it is written."""
+def read(path: Path, scene: Sidecar, episode: int | None) -> Imported:
+    """Read one episode; video is decoded when it is written.
+
+    Args:
+        path: folder of the data set.
+        scene: the sidecar with ``source``.
+        episode: which one; None if there is only one.
+
+    Raises:
+        RecordingError: the data set is damaged, or the scene maps no column or a wrong one.
+    """
     info = _info(path)
     row = _episode(path, episode)
-    fps = info.number("fps", above=0, most=10_000, suspect="milliseconds")
-    features = info.inside("features")
+    fps = info.number("fps", above=0, maximum=10_000, suspect="milliseconds")
+    features = info.group("features")
     table = _table(path, info, features, row, fps)
     source = scene.source
-    if not source.rest:
-        expected = f"the scene with {EXAMPLE}"
-        raise RecordingError(f"{path}: no column is mapped", got=f"columns {sorted(features.rest)}", expected=expected)
-    found = Imported(notes={"format": NAME, "episode": int(row["episode_index"]), "fps": fps, "unchecked": UNCHECKED})
+    if not source.remaining:
+        expected = f"the scene with {LEROBOT_SOURCE_EXAMPLE}"
+        raise RecordingError(
+            f"{path}: no column is mapped", got=f"columns {sorted(features.remaining)}", expected=expected
+        )
+    imported = Imported(
+        notes={"format": LEROBOT_NAME, "episode": int(row["episode_index"]), "fps": fps, "unchecked": LEROBOT_UNCHECKED}
+    )
     t = np.arange(len(table["frame_index"])) / fps
-    for name, fields in source.each("motion").items():
-        found.motion[name] = _motion(fields, features, table, row, t)
-    for name, fields in source.each("cameras").items():
-        found.cameras[name] = _camera(path, fields, info, features, row, t)
-    nothing_left(source)
-    return found
+    for name, fields in source.named_groups("motion").items():
+        imported.motion[name] = _motion(fields, features, table, row, t)
+    for name, fields in source.named_groups("cameras").items():
+        imported.cameras[name] = _camera(path, fields, info, features, row, t)
+    reject_unknown_keys(source)
+    return imported
 
 
 def _info(path: Path) -> Fields:
-    info = Folder(path / "meta").json("info.json")
+    info = Folder(path / "meta").read_json("info.json")
     version = info.text("codebase_version")
     if not version.startswith("v3."):
         remedy = "convert it with lerobot's own script first"
-        raise RecordingError(f"{path / INFO}: another version", got=repr(version), expected="'v3.*'", remedy=remedy)
+        raise RecordingError(
+            f"{path / INFO_FILE}: another version", got=repr(version), expected="'v3.*'", remedy=remedy
+        )
     return info
 
 
 def _read_table(file: Path, *, columns: list[str] | None = None, episode: int | None = None) -> dict[str, list[Any]]:
-    """Columns of a parquet file, of one episode or all; page checksums are verified where there are any."""
+    """Columns of a parquet file, of one episode or all; page checksums are verified if there are any."""
     try:
         from pyarrow import parquet  # pyright: ignore[reportMissingImports]  (optional)
     except ImportError as error:
         raise MissingDependency("reading LeRobot needs pyarrow", remedy='pip install "torchcloth[data]"') from error
     if not file.is_file():
         raise RecordingError(f"{file} is missing", expected="a parquet file", remedy="download it")
-    with damaged(file, "parquet file"):
+    with report_damage(file, "parquet file"):
         rows = None if episode is None else [("episode_index", "=", episode)]
         table = parquet.read_table(file, columns=columns, filters=rows, page_checksum_verification=True)
         table.validate(full=True)
@@ -93,7 +111,7 @@ def _read_table(file: Path, *, columns: list[str] | None = None, episode: int | 
 
 
 def _episode(path: Path, episode: int | None) -> dict[str, Any]:
-    """The line about one episode in meta/episodes."""
+    """Row about one episode in meta/episodes."""
     files: dict[int, Path] = {}
     for file in sorted((path / "meta" / "episodes").rglob("*.parquet")):
         for index in _read_table(file, columns=["episode_index"]).get("episode_index", [None]):
@@ -116,10 +134,10 @@ def _table(path: Path, info: Fields, features: Fields, row: dict[str, Any], fps:
     """The episode's rows, which must be one for each tick."""
     file = path / _file(info, "data_path", row, "data")
     number, length = row["episode_index"], _whole(row, "length")
-    plain = [key for key, feature in features.rest.items() if _dtype(feature) not in ("video", "image", "string")]
+    plain = [key for key, feature in features.remaining.items() if _dtype(feature) not in ("video", "image", "string")]
     columns = _read_table(file, columns=plain, episode=number)
     place = f"{file}: episode {number}"
-    with damaged(place, "table"):
+    with report_damage(place, "table"):
         table = {key: np.asarray(values) for key, values in columns.items()}
     first = _whole(row, "dataset_from_index")
     expected = {
@@ -128,8 +146,8 @@ def _table(path: Path, info: Fields, features: Fields, row: dict[str, Any], fps:
         "timestamp": np.arange(length) / fps,
     }
     for key, values in expected.items():
-        column = checks.array(table.get(key), f"{place}, {key}", (length,))
-        if not np.allclose(column, values, rtol=0, atol=TOLERANCE if key == "timestamp" else 0):
+        column = checks.check_array(table.get(key), f"{place}, {key}", (length,))
+        if not np.allclose(column, values, rtol=0, atol=LEROBOT_TIME_TOLERANCE_S if key == "timestamp" else 0):
             i = int(np.argmax(np.abs(column - values)))
             got = f"{column[i]:g} in row {i}"
             raise RecordingError(f"{place}, {key} is not regular", got=got, expected=f"{values[i]:g}")
@@ -142,26 +160,28 @@ def _motion(fields: Fields, features: Fields, table: dict, row: dict[str, Any], 
     """The arrays of motion.npz for one arm."""
     column = fields.text("column")
     names = _names(features, column, fields)
-    values = checks.array(table.get(column), f"{fields.at('column')} {column}", (len(t), len(names)))
-    _agree(values, row, column)
+    values = checks.check_array(table.get(column), f"{fields.location('column')} {column}", (len(t), len(names)))
+    _check_statistics(values, row, column)
     unit = fields.text("unit")
     if unit not in ("rad", "deg"):
-        raise RecordingError(f"{fields.at('unit')} is unknown", got=repr(unit), expected="rad or deg")
+        raise RecordingError(f"{fields.location('unit')} is unknown", got=repr(unit), expected="rad or deg")
     joints = fields.take("joints")
     if not isinstance(joints, list) or not joints:
-        raise RecordingError(f"{fields.at('joints')} is unclear", got=joints, expected="names or indices, in order")
-    q = values[:, [_index(j, names, fields.at("joints")) for j in joints]]
+        raise RecordingError(
+            f"{fields.location('joints')} is unclear", got=joints, expected="names or indices, in order"
+        )
+    q = values[:, [_index(j, names, fields.location("joints")) for j in joints]]
     out = {"t": t, "q": np.radians(q) if unit == "deg" else q}
-    width = fields.maybe(fields.take, "width")
-    scale = fields.maybe(fields.number, "width_scale", above=0) or 1.0
+    width = fields.optional(fields.take, "width")
+    scale = fields.optional(fields.number, "width_scale", above=0) or 1.0
     if width is not None:
-        out["width"] = values[:, _index(width, names, fields.at("width"))] * scale
-    closed = fields.maybe(fields.take, "closed")
+        out["width"] = values[:, _index(width, names, fields.location("width"))] * scale
+    closed = fields.optional(fields.take, "closed")
     if closed is not None:
         if not isinstance(closed, bool):
-            raise RecordingError(f"{fields.at('closed')} is unclear", got=closed, expected="true or false")
+            raise RecordingError(f"{fields.location('closed')} is unclear", got=closed, expected="true or false")
         out["closed"] = np.full(len(t), closed)
-    nothing_left(fields)
+    reject_unknown_keys(fields)
     return out
 
 
@@ -170,20 +190,22 @@ def _dtype(feature: Any) -> Any:
 
 
 def _names(features: Fields, column: str, fields: Fields) -> list[str]:
-    """The names of a vector's entries; numbers where it has none."""
+    """Names of a vector's entries; numbers if it has none."""
     if not features.has(column):
-        raise RecordingError(f"{fields.at('column')} is unknown", got=repr(column), expected=f"{sorted(features.rest)}")
-    feature = Fields(features.rest[column], features.at(column))
+        raise RecordingError(
+            f"{fields.location('column')} is unknown", got=repr(column), expected=f"{sorted(features.remaining)}"
+        )
+    feature = Fields(features.remaining[column], features.location(column))
     shape = feature.array("shape", "N", kind="int").tolist()
     if len(shape) != 1:
-        raise RecordingError(f"{features.at(column)} is no vector", got=shape, expected="one dimension")
-    names = feature.rest.get("names")
+        raise RecordingError(f"{features.location(column)} is no vector", got=shape, expected="one dimension")
+    names = feature.remaining.get("names")
     if isinstance(names, dict):  # lerobot also writes {"motors": [...]}
         names = next(iter(names.values()), None)
     if names is None:
         return [str(i) for i in range(shape[0])]
     if not isinstance(names, list) or len(names) != shape[0] or len({str(n) for n in names}) != shape[0]:
-        raise RecordingError(f"{features.at(column)}.names do not fit", got=names, expected=f"{shape[0]} names")
+        raise RecordingError(f"{features.location(column)}.names do not fit", got=names, expected=f"{shape[0]} names")
     return [str(n) for n in names]
 
 
@@ -195,60 +217,65 @@ def _index(word: Any, names: list[str], place: str) -> int:
     raise RecordingError(f"{place} is unknown", got=repr(word), expected=f"one of {', '.join(names)}")
 
 
-def _agree(values: np.ndarray, row: dict[str, Any], column: str) -> None:
-    """Hold a column against the statistics that LeRobot kept when it recorded."""
-    size, rounding = np.abs(values).max() + 1e-9, len(values) * ROUNDING
-    for name, of in (("min", values.min(axis=0)), ("max", values.max(axis=0)), ("mean", values.mean(axis=0))):
-        kept = row.get(f"stats/{column}/{name}")
-        if kept is None:
+def _check_statistics(values: np.ndarray, row: dict[str, Any], column: str) -> None:
+    """Check a column against the statistics that LeRobot stored when it recorded."""
+    size, rounding = np.abs(values).max() + 1e-9, len(values) * FLOAT32_ROUNDING
+    for name, computed in (("min", values.min(axis=0)), ("max", values.max(axis=0)), ("mean", values.mean(axis=0))):
+        stored = row.get(f"stats/{column}/{name}")
+        if stored is None:
             continue
-        kept = checks.array(kept, f"{row['file']}: stats/{column}/{name}", of.shape)
-        if np.abs(kept - of).max() > max(AGREE, rounding if name == "mean" else 0.0) * size:
-            i = int(np.argmax(np.abs(kept - of)))
-            got, expected = f"a {name} of {of[i]:.9g} in entry {i}", f"{kept[i]:.9g}, as recorded"
+        stored = checks.check_array(stored, f"{row['file']}: stats/{column}/{name}", computed.shape)
+        if np.abs(stored - computed).max() > max(STATISTICS_TOLERANCE, rounding if name == "mean" else 0.0) * size:
+            i = int(np.argmax(np.abs(stored - computed)))
+            got, expected = f"a {name} of {computed[i]:.9g} in entry {i}", f"{stored[i]:.9g}, as recorded"
             raise RecordingError(f"{column} contradicts its statistics", got=got, expected=expected)
 
 
 def _camera(
     path: Path, fields: Fields, info: Fields, features: Fields, row: dict[str, Any], t: np.ndarray
 ) -> ImportedCamera:
-    """A camera whose colour images are a stretch of a video."""
+    """A camera whose colour images are a section of a video."""
     key = fields.text("color")
-    nothing_left(fields)
+    reject_unknown_keys(fields)
     if not features.has(key):
-        raise RecordingError(f"{fields.at('color')} is unknown", got=repr(key), expected=f"{sorted(features.rest)}")
-    feature = Fields(features.rest[key], features.at(key))
-    if _dtype(feature.rest) != "video":
-        raise RecordingError(f"{features.at(key)} is no video", got=_dtype(feature.rest), expected="video")
-    names: Any = feature.rest.get("names")
+        raise RecordingError(
+            f"{fields.location('color')} is unknown", got=repr(key), expected=f"{sorted(features.remaining)}"
+        )
+    feature = Fields(features.remaining[key], features.location(key))
+    if _dtype(feature.remaining) != "video":
+        raise RecordingError(f"{features.location(key)} is no video", got=_dtype(feature.remaining), expected="video")
+    names: Any = feature.remaining.get("names")
     shape: dict[Any, int] = dict(zip(names or (), feature.array("shape", 3, kind="int").tolist(), strict=False))
     if not {"height", "width"} <= shape.keys():
-        raise RecordingError(f"{feature.at('names')} are unclear", got=names, expected="height, width, channels")
+        raise RecordingError(f"{feature.location('names')} are unclear", got=names, expected="height, width, channels")
     size = shape["width"], shape["height"]
     file = path / _file(info, "video_path", row, f"videos/{key}", video_key=key)
     if not file.is_file():
         raise RecordingError(f"{file} is missing", expected="a video", remedy="download it")
     start = row.get(f"videos/{key}/from_timestamp")
     end = row.get(f"videos/{key}/to_timestamp")
-    span = checks.array([start, end], f"{row['file']}: videos/{key}", (2,))
+    span = checks.check_array([start, end], f"{row['file']}: videos/{key}", (2,))
     step = t[1] if len(t) > 1 else span[1] - span[0]
-    if not 0 <= span[0] <= LONGEST or abs(span[1] - span[0] - len(t) * step) > TOLERANCE * 10:
+    if (
+        not 0 <= span[0] <= MAX_VIDEO_DURATION_S
+        or abs(span[1] - span[0] - len(t) * step) > LEROBOT_TIME_TOLERANCE_S * 10
+    ):
         got = f"{span[1] - span[0]:g} s for {len(t)} frames"
         raise RecordingError(f"{row['file']}: videos/{key} does not last", got=got, expected=f"{len(t) * step:g} s")
-    times = np.round((span[0] + t) * NANO).astype(np.int64)
-    frames = VideoFrames(file, 0, "color", times, round(TOLERANCE * NANO))
+    times = np.round((span[0] + t) * NANOSECONDS_PER_SECOND).astype(np.int64)
+    frames = VideoFrames(file, 0, "color", times, round(LEROBOT_TIME_TOLERANCE_S * NANOSECONDS_PER_SECOND))
     stream = ImageStream("color", np.arange(len(t)), t, (), size, frames)
     return ImportedCamera({"width": size[0], "height": size[1]}, {"color": stream})
 
 
 def _file(info: Fields, key: str, row: dict[str, Any], group: str, **names: str) -> str:
-    """A path from its template in info.json."""
-    template = str(info.rest.get(key, ""))
+    """Path from its template in info.json."""
+    template = str(info.remaining.get(key, ""))
     numbers = {n: _whole(row, f"{group}/{n}") for n in ("chunk_index", "file_index")}
-    with damaged(info.at(key), "path template"):
+    with report_damage(info.location(key), "path template"):
         path = template.format(**numbers, **names)
     if not path or Path(path).is_absolute() or ".." in Path(path).parts:
-        raise RecordingError(f"{info.at(key)} leaves the data set", got=repr(template))
+        raise RecordingError(f"{info.location(key)} leaves the data set", got=repr(template))
     return path
 
 
@@ -257,3 +284,6 @@ def _whole(row: dict[str, Any], key: str) -> int:
     if not isinstance(value, int) or isinstance(value, bool) or value < 0:
         raise RecordingError(f"{row['file']}: {key} is no number", got=repr(value), expected="a whole number")
     return value
+
+
+LEROBOT_IMPORTER = Importer(LEROBOT_NAME, LEROBOT_TITLE, matches, read)

@@ -1,7 +1,7 @@
-"""The checksums of an MCAP file: verified when reading, filled in after writing.
+"""Checksums of an MCAP file: verified when it is read, filled in after it was written.
 
-rosbags verifies those of chunks and writes none (0 stands for none, https://mcap.dev/spec). The data section's and the
-summary's together cover every byte that is read.
+rosbags verifies those of chunks and writes none (0 means none, https://mcap.dev/spec). Those of the data section and of
+the summary together cover every byte that is read.
 """
 
 from __future__ import annotations
@@ -13,15 +13,15 @@ from zlib import crc32
 
 from ...errors import RecordingError
 
-MAGIC = b"\x89MCAP0\r\n"
-FOOTER = 9 + 20 + len(MAGIC)  # bytes of the footer record and the magic after it
-MESSAGE, CHUNK, DATA_END, FOOTER_OP = 0x05, 0x06, 0x0F, 0x02
-BLOCK = 1 << 20
-Cover = Literal["all bytes", "messages", "none"]
+MCAP_SIGNATURE = b"\x89MCAP0\r\n"
+FOOTER_BYTES = 9 + 20 + len(MCAP_SIGNATURE)  # the footer record and the signature after it
+MESSAGE_OPCODE, CHUNK_OPCODE, DATA_END_OPCODE, FOOTER_OPCODE = 0x05, 0x06, 0x0F, 0x02
+READ_BLOCK_BYTES = 1 << 20
+ChecksumCoverage = Literal["all bytes", "messages", "none"]
 
 
-def verify(path: Path) -> Cover:
-    """Check the checksums of the sections, and say what is under one; rosbags checks those of the chunks.
+def verify_checksums(path: Path) -> ChecksumCoverage:
+    """Verify the checksums of the sections and return what they cover; rosbags verifies those of the chunks.
 
     Raises:
         RecordingError: a checksum does not match, or the file has no end.
@@ -42,7 +42,7 @@ def verify(path: Path) -> Cover:
         return "all bytes" if data_crc else "messages" if chunked else "none"
 
 
-def seal(path: Path) -> None:
+def write_checksums(path: Path) -> None:
     """Fill in the checksums of an MCAP file that has none."""
     with path.open("r+b") as file:
         data_end, _, summary_at, end, _ = _sections(file, path)
@@ -51,30 +51,30 @@ def seal(path: Path) -> None:
 
 
 def _sections(file: BinaryIO, path: Path) -> tuple[int, int, int, int, bool]:
-    """Where the data ends, the summary's checksum, where the summary begins, where its checksum is stored.
+    """End of the data, checksum of the summary, start of the summary, and place of its checksum.
 
-    Last, whether every message is in a chunk with a checksum.
+    The last value says whether every message is in a chunk with a checksum.
     """
     size = file.seek(0, 2)
-    file.seek(max(0, size - FOOTER))
+    file.seek(max(0, size - FOOTER_BYTES))
     tail = file.read()
-    if size < FOOTER + len(MAGIC) or tail[-8:] != MAGIC or tail[0] != FOOTER_OP:
+    if size < FOOTER_BYTES + len(MCAP_SIGNATURE) or tail[-8:] != MCAP_SIGNATURE or tail[0] != FOOTER_OPCODE:
         raise RecordingError(f"{path} has no end", expected="an MCAP footer", remedy="`mcap recover` may mend it")
     start, _, crc = struct.unpack("<QQI", tail[9:29])
-    footer = size - FOOTER
-    at, chunked = len(MAGIC), True
+    footer = size - FOOTER_BYTES
+    at, chunked = len(MCAP_SIGNATURE), True
     while at < footer:
         file.seek(at)
         head = file.read(9)
-        if head[0] == DATA_END:
+        if head[0] == DATA_END_OPCODE:
             summary = start or footer
             if summary != at + 13 or struct.unpack("<Q", head[1:]) != (4,):
                 raise RecordingError(f"{path} is damaged", got="a summary that is not where the footer says")
             return at, crc, summary, footer + 9 + 16, chunked
-        if head[0] == CHUNK:  # its checksum lies behind two times and a length
+        if head[0] == CHUNK_OPCODE:  # its checksum follows two times and a length
             file.seek(24, 1)
             chunked &= file.read(4) != bytes(4)
-        chunked &= head[0] != MESSAGE
+        chunked &= head[0] != MESSAGE_OPCODE
         (length,) = struct.unpack("<Q", head[1:])
         at += 9 + length
     raise RecordingError(f"{path} is damaged", got="no end of its data", remedy="`mcap recover` may mend it")
@@ -82,9 +82,9 @@ def _sections(file: BinaryIO, path: Path) -> tuple[int, int, int, int, bool]:
 
 def _crc(file: BinaryIO, start: int, stop: int) -> int:
     file.seek(start)
-    crc, left = 0, stop - start
-    while left > 0 and (block := file.read(min(BLOCK, left))):
-        crc, left = crc32(block, crc), left - len(block)
+    crc, remaining = 0, stop - start
+    while remaining > 0 and (block := file.read(min(READ_BLOCK_BYTES, remaining))):
+        crc, remaining = crc32(block, crc), remaining - len(block)
     return crc
 
 

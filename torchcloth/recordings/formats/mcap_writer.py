@@ -1,11 +1,12 @@
-"""Writes a recording as one MCAP file of standard ROS 2 messages, by rosbags, with checksums over every byte.
+"""Writer of MCAP files: a recording as one file of standard ROS 2 messages, with checksums over every byte.
 
     /NAME/pose, /NAME/closed, /NAME/joints, /NAME/wrench      PoseStamped, Bool, JointState, WrenchStamped
     /points                                                   PointCloud2, x y z in float64
     /CAMERA/info, /CAMERA/depth, /CAMERA/color, /CAMERA/mask  CameraInfo, CompressedImage (the files as they are)
-    /torchcloth/scene, /torchcloth/files                      the rest, see `embedded`
+    /torchcloth/scene, /torchcloth/files                      the rest, see ``embedded``
 
-Times are whole nanoseconds: those of the recording are rounded by at most half a nanosecond.
+The messages are written by rosbags. Times are integer nanoseconds: those of the recording are rounded by at most half a
+nanosecond.
 """
 
 from __future__ import annotations
@@ -27,13 +28,13 @@ from .. import atomic_write, images, streams, writing
 from ..files import save_npz
 from ..types import Camera, PointClouds, Recording
 from . import embedded, mcap_checksums, ros2
-from .imported import NANO
-from .ros2_topics import WORLD
-from .sidecar import Scene
+from .imported import NANOSECONDS_PER_SECOND
+from .ros2_topics import WORLD_FRAMES
+from .sidecar import Sidecar
 
-Event = tuple[int, Callable[[], None]]  # ns, and what writes the message of that time
-FINGER = "finger_width"
-LATEST = 2**31 * NANO  # ns, the first time that a stamp cannot hold
+WriteEvent = tuple[int, Callable[[], None]]  # ns, and what writes the message of that time
+FINGER_JOINT_NAME = "finger_width"
+STAMP_LIMIT_NS = 2**31 * NANOSECONDS_PER_SECOND  # the first time that a stamp cannot represent
 
 
 def write(
@@ -43,7 +44,13 @@ def write(
     overwrite: bool = False,
     on_image: Callable[[], None] = lambda: None,
 ) -> Path:
-    """Write ``path`` atomically; `formats.read` gives the recording back.
+    """Write ``path`` atomically; ``formats.read`` gives the recording back.
+
+    Args:
+        recording: to write.
+        path: the file.
+        overwrite: replace an existing file.
+        on_image: called after each image, for a progress bar.
 
     Raises:
         RecordingError: the file exists, or cannot be written.
@@ -54,14 +61,14 @@ def write(
         raise RecordingError(f"{target} exists", expected="a new name", remedy="pass overwrite=True to replace a file")
     part = target.absolute().with_name(f".{target.name}.{uuid.uuid4().hex}.partial")
     try:
-        with atomic_write.room_for(part):
+        with atomic_write.temporary_path(part):
             _Bag(part, recording, on_image).write()
             file = part / f"{part.name}.mcap"
-            mcap_checksums.seal(file)
+            mcap_checksums.write_checksums(file)
             _read_back(file, target)
-            atomic_write.sync(file)
+            atomic_write.sync_to_disk(file)
             file.replace(target.absolute())
-            atomic_write.sync(target.absolute().parent)
+            atomic_write.sync_to_disk(target.absolute().parent)
     except (OSError, ValueError, TypeError) as error:
         if isinstance(error, RecordingError | MissingDependency):
             raise
@@ -70,17 +77,17 @@ def write(
 
 
 def _read_back(file: Path, target: Path) -> None:
-    """Refuse what cannot be read again, under the final name."""
-    scene = Scene.read(None)
+    """Refuse a file that cannot be read again, under its final name."""
+    scene = Sidecar.read(None)
     try:
-        scene.complete(ros2.read(file, scene, None), target)
+        scene.complete_recording(ros2.read(file, scene, None), target)
     except RecordingError as error:
         what = error.what.replace(str(file), str(target))
         raise RecordingError(what, got=error.got, expected=error.expected, remedy=error.remedy) from error
 
 
 class _Bag:
-    """One recording on its way into a bag."""
+    """A recording that is being written into a bag."""
 
     def __init__(self, folder: Path, recording: Recording, on_image: Callable[[], None]) -> None:
         try:
@@ -93,15 +100,15 @@ class _Bag:
         self.bag = Writer(folder, version=9, storage_plugin=StoragePlugin.MCAP)
         self.recording, self.on_image = recording, on_image
         self.epoch = _epoch(recording)
-        self.events: list[Event] = []
+        self.events: list[WriteEvent] = []
         self.images: list[Iterator[Any]] = []
         self.mapping: dict[str, Any] = {"epoch": self.epoch, "motion": {}, "cameras": {}}
-        if (own := recording.extra.get("source")) is not None:
-            self.mapping["origin"] = own  # where the recording is from
+        if (source := recording.extra.get("source")) is not None:
+            self.mapping["origin"] = source  # the file that the recording was imported from
 
     def write(self) -> None:
-        """Write every message in the order of time."""
-        writing.motion_arrays(self.recording)  # a name's pose and joints share what is stored once
+        """Write streams_by_kind message in the order of time."""
+        writing.build_motion_arrays(self.recording)  # checks that pose and joints of a name agree in shared arrays
         with self.bag:
             for name in {**self.recording.grippers, **self.recording.joints}:
                 self._motion(name)
@@ -111,10 +118,10 @@ class _Bag:
                 self._camera(name, camera)
             first = min((ns for ns, _ in self.events), default=self.epoch)
             self._rest(first)
-            for _, put in sorted(self.events, key=lambda event: event[0]):  # stable: as they came where times agree
+            for _, put in sorted(self.events, key=lambda event: event[0]):  # the sort is stable for equal times
                 put()
             for files in self.images:
-                deque(files, 0)  # to their ends: what is wrong with a whole file is said there
+                deque(files, 0)  # iterate to the end, where errors of a whole stream are raised
 
     def _topic(self, name: str, kind: str, message: Callable[[int], Any], times: Any, *, first: bool = False) -> str:
         """Add a topic with the message ``message(i)`` at each of ``times`` [ns]."""
@@ -132,25 +139,28 @@ class _Bag:
     def _type(self, kind: str, *values: Any) -> Any:
         return self.store.types[kind](*values)
 
-    def _header(self, ns: int, frame: str = WORLD[0]) -> Any:
-        time = self._type("builtin_interfaces/msg/Time", *divmod(ns, NANO))
+    def _header(self, ns: int, frame: str = WORLD_FRAMES[0]) -> Any:
+        time = self._type("builtin_interfaces/msg/Time", *divmod(ns, NANOSECONDS_PER_SECOND))
         return self._type("std_msgs/msg/Header", time, frame)
 
     def _times(self, t: np.ndarray) -> list[int]:
-        times = [self.epoch + round(value * NANO) for value in t.tolist()]
-        if max(times, default=0) >= LATEST:
-            got, expected = f"a time of {float(t.max()):g} s", f"less than {(LATEST - self.epoch) / NANO:g} s"
+        times = [self.epoch + round(value * NANOSECONDS_PER_SECOND) for value in t.tolist()]
+        if max(times, default=0) >= STAMP_LIMIT_NS:
+            got, expected = (
+                f"a time of {float(t.max()):g} s",
+                f"less than {(STAMP_LIMIT_NS - self.epoch) / NANOSECONDS_PER_SECOND:g} s",
+            )
             raise RecordingError("stamps of ROS 2 end in 2038", got=got, expected=expected, remedy="begin at 0 s")
         return times
 
     def _motion(self, name: str) -> None:
         gripper, arm = self.recording.grippers.get(name), self.recording.joints.get(name)
         shared: Any = gripper or arm
-        times, base = self._times(shared.t), f"/{_word(name)}"
-        said: dict[str, Any] = {}
+        times, base = self._times(shared.t), f"/{_topic_name(name)}"
+        mapping: dict[str, Any] = {}
         if gripper is not None:
             kind = "geometry_msgs/msg/PoseStamped"
-            said["pose"] = self._topic(
+            mapping["pose"] = self._topic(
                 f"{base}/pose",
                 kind,
                 lambda i: self._type(
@@ -159,12 +169,12 @@ class _Bag:
                 times,
             )
         if arm is not None:
-            said["joints"] = self._joints(f"{base}/joints", arm, times)
+            mapping["joints"] = self._joints(f"{base}/joints", arm, times)
         if shared.closed is not None:
             kind_of = "std_msgs/msg/Bool"
             closed = shared.closed
             changes = np.flatnonzero(np.diff(closed, prepend=~closed[:1]))
-            said["closed"] = self._topic(
+            mapping["closed"] = self._topic(
                 f"{base}/closed",
                 kind_of,
                 lambda i: self._type(kind_of, bool(closed[changes[i]])),
@@ -172,8 +182,8 @@ class _Bag:
                 first=True,
             )
         if shared.force is not None or shared.torque is not None:
-            said |= {"wrench": self._wrench(f"{base}/wrench", shared, times), "wrench_frame": "world"}
-        self.mapping["motion"][name] = said
+            mapping |= {"wrench": self._wrench(f"{base}/wrench", shared, times), "wrench_frame": "world"}
+        self.mapping["motion"][name] = mapping
 
     def _pose(self, position: np.ndarray, quat: np.ndarray) -> Any:
         w, x, y, z = quat.tolist()
@@ -184,15 +194,18 @@ class _Bag:
         names = [f"joint_{j + 1}" for j in range(arm.q.shape[1])]
         kind, none = "sensor_msgs/msg/JointState", np.zeros(0)
         values = np.ascontiguousarray(arm.q if arm.width is None else np.column_stack([arm.q, arm.width]))
-        every = names if arm.width is None else [*names, FINGER]
+        streams_by_kind = names if arm.width is None else [*names, FINGER_JOINT_NAME]
         self._topic(
-            topic, kind, lambda i: self._type(kind, self._header(times[i], ""), every, values[i], none, none), times
+            topic,
+            kind,
+            lambda i: self._type(kind, self._header(times[i], ""), streams_by_kind, values[i], none, none),
+            times,
         )
-        return {"topic": topic, "names": names, **({} if arm.width is None else {"width": FINGER})}
+        return {"topic": topic, "names": names, **({} if arm.width is None else {"width": FINGER_JOINT_NAME})}
 
     def _wrench(self, topic: str, motion: Any, times: list[int]) -> str:
         kind, vector = "geometry_msgs/msg/WrenchStamped", "geometry_msgs/msg/Vector3"
-        none = np.full((len(times), 3), np.nan)  # was not measured
+        none = np.full((len(times), 3), np.nan)  # means that it was not measured
         force = none if motion.force is None else motion.force
         torque = none if motion.torque is None else motion.torque
 
@@ -215,15 +228,17 @@ class _Bag:
         self.mapping["points"] = {"topic": self._topic("/points", kind, message, times)}
 
     def _camera(self, name: str, camera: Camera) -> None:
-        every: dict[images.Kind, images.ImageStream]
-        every = {kind: getattr(camera, kind) for kind in images.KINDS if getattr(camera, kind) is not None}
-        if not every:
+        streams_by_kind: dict[images.ImageKind, images.ImageStream]
+        streams_by_kind = {
+            kind: getattr(camera, kind) for kind in images.IMAGE_KINDS if getattr(camera, kind) is not None
+        }
+        if not streams_by_kind:
             return
-        base = f"/{_word(name)}"
-        said: dict[str, Any] = {"frames": {kind: stream.frames.tolist() for kind, stream in every.items()}}
-        for kind, stream in every.items():
-            said[kind] = self._images(f"{base}/{kind}", stream)
-        kind_of, first = "sensor_msgs/msg/CameraInfo", min(self._times(s.t)[0] for s in every.values())
+        base = f"/{_topic_name(name)}"
+        mapping: dict[str, Any] = {"frames": {kind: stream.frames.tolist() for kind, stream in streams_by_kind.items()}}
+        for kind, stream in streams_by_kind.items():
+            mapping[kind] = self._images(f"{base}/{kind}", stream)
+        kind_of, first = "sensor_msgs/msg/CameraInfo", min(self._times(s.t)[0] for s in streams_by_kind.values())
         region = self._type("sensor_msgs/msg/RegionOfInterest", 0, 0, 0, 0, False)
         P = np.column_stack([camera.K, np.zeros(3)])
         model = "plumb_bob" if len(camera.distortion) <= 5 else "rational_polynomial"
@@ -231,15 +246,15 @@ class _Bag:
         message = self._type(
             kind_of, self._header(first, name), *size, model, camera.distortion, K, R, P.reshape(-1), 0, 0, region
         )
-        said["info"] = self._topic(f"{base}/info", kind_of, lambda _: message, [first], first=True)
-        self.mapping["cameras"][name] = said | {"rectified": False}
+        mapping["info"] = self._topic(f"{base}/info", kind_of, lambda _: message, [first], first=True)
+        self.mapping["cameras"][name] = mapping | {"rectified": False}
 
     def _images(self, topic: str, stream: images.ImageStream) -> str:
-        kind, times, files = "sensor_msgs/msg/CompressedImage", self._times(stream.t), stream.files()
+        kind, times, files = "sensor_msgs/msg/CompressedImage", self._times(stream.t), stream.iterate_files()
         self.images.append(files)
 
         def message(i: int) -> Any:
-            _, suffix, data = next(files)  # called in the order of time, which is theirs
+            _, suffix, data = next(files)  # messages are written in the order of time, which is that of the files
             self.on_image()
             pixels = np.frombuffer(data, dtype=np.uint8)
             return self._type(kind, self._header(times[i]), "png" if suffix == ".png" else "jpeg", pixels)
@@ -247,7 +262,7 @@ class _Bag:
         return self._topic(topic, kind, message, times)
 
     def _rest(self, first: int) -> None:
-        """The scene and the small files, at the beginning."""
+        """Write the scene and the small files at the beginning."""
         small = list(_files(self.recording))
         layout, dimension = "std_msgs/msg/MultiArrayLayout", "std_msgs/msg/MultiArrayDimension"
         kind = "std_msgs/msg/UInt8MultiArray"
@@ -258,30 +273,32 @@ class _Bag:
             return self._type(kind, self._type(layout, [size], 0), np.frombuffer(data, dtype=np.uint8))
 
         if small:
-            self._topic(embedded.FILES, kind, file, [first] * len(small), first=True)
-        scene = json.dumps({**writing.episode(self.recording), "source": self.mapping}, default=writing.plain)
+            self._topic(embedded.FILES_TOPIC, kind, file, [first] * len(small), first=True)
+        scene = json.dumps(
+            {**writing.build_episode_json(self.recording), "source": self.mapping}, default=writing.to_json_value
+        )
         text = "std_msgs/msg/String"
-        self._topic(embedded.SCENE, text, lambda _: self._type(text, scene), [first], first=True)
+        self._topic(embedded.SCENE_TOPIC, text, lambda _: self._type(text, scene), [first], first=True)
 
 
 def _files(recording: Recording) -> Iterator[tuple[str, bytes]]:
-    """Small files by name, and the arrays that no standard message has a place for."""
+    """Small files by name, and the arrays for which no standard message has a place."""
     cloth = recording.cloth
     if cloth.vertices is not None and cloth.faces is not None:
-        yield writing.MESH, obj.dump(cloth.vertices, cloth.faces, cloth.uv).encode()
+        yield writing.MESH_FILE, obj.dump(cloth.vertices, cloth.faces, cloth.uv).encode()
     if cloth.initial_vertices is not None:
         file = io.BytesIO()
         np.save(file, cloth.initial_vertices, allow_pickle=False)
-        yield writing.INITIAL, file.getvalue()
-    for name, held in ((streams.MARKERS, recording.markers), (streams.TRUTH, recording.truth)):
-        if held is not None:
-            yield name, _npz(writing.held(held))
+        yield writing.INITIAL_VERTICES_FILE, file.getvalue()
+    for name, stream in ((streams.MARKERS_FILE, recording.markers), (streams.TRUTH_FILE, recording.truth)):
+        if stream is not None:
+            yield name, _npz(writing.bag_fields(stream))
     motions = [*recording.joints.items(), *recording.grippers.items()]
     extra = {f"motion/{name}/{key}": value for name, motion in motions for key, value in motion.extra.items()}
     if recording.points is not None:
         extra |= {f"points/{key}": value for key, value in recording.points.extra.items()}
     if extra:
-        yield embedded.EXTRA, _npz(extra)
+        yield embedded.EXTRA_ARRAYS_FILE, _npz(extra)
 
 
 def _npz(arrays: dict[str, Any]) -> bytes:
@@ -291,17 +308,17 @@ def _npz(arrays: dict[str, Any]) -> bytes:
 
 
 def _epoch(recording: Recording) -> int:
-    """The absolute time [ns] of t = 0: as in the file it was imported from, else such that no time is before 1 s."""
+    """Absolute time [ns] of t = 0: that of the imported file, or else such that no time is before 1 s."""
     bags = [*recording.grippers.values(), *recording.joints.values(), recording.points]
     bags += [s for c in recording.cameras.values() for s in (c.depth, c.color, c.mask)]
     earliest = min((float(bag.t[0]) for bag in bags if bag is not None), default=0.0)
     known = recording.extra.get("source")
     start = known.get("start_ns") if isinstance(known, dict) else None
-    if isinstance(start, int) and start + earliest * NANO >= NANO:
+    if isinstance(start, int) and start + earliest * NANOSECONDS_PER_SECOND >= NANOSECONDS_PER_SECOND:
         return start
-    return NANO * (1 - min(0, int(np.floor(earliest))))
+    return NANOSECONDS_PER_SECOND * (1 - min(0, int(np.floor(earliest))))
 
 
-def _word(name: str) -> str:
+def _topic_name(name: str) -> str:
     """A name as ROS allows it in a topic."""
     return re.sub(r"\W", "_", name, flags=re.ASCII)

@@ -1,14 +1,14 @@
-"""RGB-D folders as Open3D and the Redwood data sets lay them out.
+"""RGB-D folders in the layout of Open3D and the Redwood data sets.
 
     color/*.jpg|png  depth/*.png  camera_intrinsic.json|intrinsic.json  [trajectory.log]
 
-The intrinsic matrix in Open3D's JSON is stored column by column; the poses in a ``.log`` are camera-to-world, of a
+The intrinsic matrix in Open3D's JSON is stored column by column. The poses in a ``.log`` are camera-to-world, of a
 camera in the OpenCV convention. Depth is in millimetres unless the file says otherwise. Times are in the names of
-Redwood's images (``FRAME-MICROSECONDS.png``); Open3D's own carry none, then ``fps`` comes from the intrinsic file
-that its recorders write, or from the scene. Images are pairs in the order of their names.
+Redwood's images (``FRAME-MICROSECONDS.png``). Open3D's own images carry none; then ``fps`` comes from the intrinsic
+file that its recorders write, or from the scene. Images are pairs in the order of their names.
 
-Text carries no checksum: a changed digit in the intrinsic or pose files goes unnoticed where it stays plausible, and
-so do changed bytes in the pixels of a JPEG; PNG files are verified.
+Text carries no checksum: a changed digit in the intrinsic or pose files goes unnoticed if it stays plausible, and so do
+changed bytes in the pixels of a JPEG. PNG files are verified.
 """
 
 from __future__ import annotations
@@ -22,91 +22,108 @@ import numpy as np
 from ...errors import RecordingError
 from .. import checks
 from ..files import Folder
-from ..images import ImageStream, Kind
+from ..images import ImageKind, ImageStream
 from .imported import (
-    NANO,
+    NANOSECONDS_PER_SECOND,
     FileImages,
     Imported,
     ImportedCamera,
-    file_text,
-    fixed_pose,
+    Importer,
+    check_depth_scale,
     image_size,
-    nothing_left,
-    plausible,
-    seconds,
+    read_text,
+    reject_unknown_keys,
+    require_fixed_pose,
+    to_seconds,
 )
-from .sidecar import Scene
+from .sidecar import Sidecar
 
-NAME = "redwood"
-TITLE = "Open3D/Redwood RGB-D folder"
-COLOR, INTRINSIC = ("color", "rgb", "image"), ("camera_intrinsic.json", "intrinsic.json", "camera.json")
-TRAJECTORY = ("trajectory.log", "scene/trajectory.log")
-CAMERA = "cam0"
-UNCHECKED = "intrinsics, pose, and pixels of JPEG images"
-MILLIMETRE = 0.001
-TOGETHER = 50_000_000  # ns between the images of a pair
+REDWOOD_NAME = "redwood"
+REDWOOD_TITLE = "Open3D/Redwood RGB-D folder"
+COLOR_FOLDERS, INTRINSIC_FILES = ("color", "rgb", "image"), ("camera_intrinsic.json", "intrinsic.json", "camera.json")
+TRAJECTORY_FILES = ("trajectory.log", "scene/trajectory.log")
+REDWOOD_CAMERA_NAME = "cam0"
+REDWOOD_UNCHECKED = "intrinsics, pose, and pixels of JPEG images"
+REDWOOD_DEPTH_SCALE_M = 0.001
+MAX_PAIR_DELAY_NS = 50_000_000  # between the images of a pair
 _STAMPED = re.compile(r"\d+-(\d{6,15})")
 
 
 def matches(path: Path) -> bool:
-    """Whether the folder is laid out like this."""
-    color = any((path / name).is_dir() for name in COLOR)
-    return (path / "depth").is_dir() and color and any((path / name).is_file() for name in INTRINSIC)
+    """Return whether a folder has this layout."""
+    color = any((path / name).is_dir() for name in COLOR_FOLDERS)
+    return (path / "depth").is_dir() and color and any((path / name).is_file() for name in INTRINSIC_FILES)
 
 
-def read(path: Path, scene: Scene, episode: int | None) -> Imported:
-    """Read the folder; the images are checked when they are copied."""
+def read(path: Path, scene: Sidecar, episode: int | None) -> Imported:
+    """Read the folder; the images are checked when they are copied.
+
+    Args:
+        path: the folder.
+        scene: the sidecar.
+        episode: unused; a folder holds one episode.
+
+    Raises:
+        RecordingError: the folder is damaged, or its images are not pairs.
+    """
     source = scene.source
-    name = source.maybe(source.text, "camera") or CAMERA
-    fps = source.maybe(source.number, "fps", above=0, most=1000, suspect="milliseconds")
-    nothing_left(source)
+    name = source.optional(source.text, "camera") or REDWOOD_CAMERA_NAME
+    fps = source.optional(source.number, "fps", above=0, maximum=1000, suspect="milliseconds")
+    reject_unknown_keys(source)
     camera, fps = _camera(path, fps)
-    camera.known.setdefault("depth_scale", scene.depth_scale(name) or MILLIMETRE)
-    color = _images(path / next(n for n in COLOR if (path / n).is_dir()), (".jpg", ".jpeg", ".png"))
+    camera.calibration.setdefault("depth_scale", scene.depth_scale(name) or REDWOOD_DEPTH_SCALE_M)
+    color = _images(path / next(n for n in COLOR_FOLDERS if (path / n).is_dir()), (".jpg", ".jpeg", ".png"))
     depth = _images(path / "depth", (".png",))
     if len(color) != len(depth):
         got = f"{len(color)} colour and {len(depth)} depth images"
         raise RecordingError(f"{path} is not made of pairs", got=got, expected="as many of each")
     times = {"color": _times(color, fps), "depth": _times(depth, fps)}
     apart = np.abs(times["color"] - times["depth"])
-    if apart.max() > TOGETHER:
-        got = f"{apart.max() / NANO:.3g} s between {color[int(apart.argmax())].name} and its depth image"
-        raise RecordingError(f"{path} is not made of pairs", got=got, expected=f"at most {TOGETHER / NANO:g} s")
+    if apart.max() > MAX_PAIR_DELAY_NS:
+        name_of_worst = color[int(apart.argmax())].name
+        got = f"{apart.max() / NANOSECONDS_PER_SECOND:.3g} s between {name_of_worst} and its depth image"
+        raise RecordingError(
+            f"{path} is not made of pairs",
+            got=got,
+            expected=f"at most {MAX_PAIR_DELAY_NS / NANOSECONDS_PER_SECOND:g} s",
+        )
     start = int(min(t[0] for t in times.values()))
-    size = camera.known["width"], camera.known["height"]
-    kinds: dict[Kind, list[Path]] = {"depth": depth, "color": color}
+    size = camera.calibration["width"], camera.calibration["height"]
+    kinds: dict[ImageKind, list[Path]] = {"depth": depth, "color": color}
     for kind, paths in kinds.items():
         numbers = np.arange(len(paths))
-        stream = ImageStream(kind, numbers, seconds(times[kind], start), (), size, FileImages(paths))
+        stream = ImageStream(kind, numbers, to_seconds(times[kind], start), (), size, FileImages(paths))
         camera.streams[kind] = stream
     if image_size(depth[0]) != size:
         raise RecordingError(f"{depth[0]} has the wrong size", got=image_size(depth[0]), expected=f"{size}")
-    plausible(camera.streams["depth"], camera.known["depth_scale"], depth[0])
-    found = Imported(cameras={name: camera}, notes={"format": NAME, "start_ns": start, "unchecked": UNCHECKED})
-    log = next((path / n for n in TRAJECTORY if (path / n).is_file()), None)
+    check_depth_scale(camera.streams["depth"], camera.calibration["depth_scale"], depth[0])
+    imported = Imported(
+        cameras={name: camera}, notes={"format": REDWOOD_NAME, "start_ns": start, "unchecked": REDWOOD_UNCHECKED}
+    )
+    log = next((path / n for n in TRAJECTORY_FILES if (path / n).is_file()), None)
     if log is not None:
-        camera.known["T_world_camera"] = fixed_pose(_poses(log, len(depth)), str(log))
-    return found
+        camera.calibration["T_world_camera"] = require_fixed_pose(_poses(log, len(depth)), str(log))
+    return imported
 
 
 def _camera(path: Path, fps: float | None) -> tuple[ImportedCamera, float | None]:
     """Intrinsics, and what Open3D's recorders add: the rate and the depth scale."""
-    file = path / next(n for n in INTRINSIC if (path / n).is_file())
-    fields = Folder(file.parent).json(file.name)
+    file = path / next(n for n in INTRINSIC_FILES if (path / n).is_file())
+    fields = Folder(file.parent).read_json(file.name)
     flat = fields.array("intrinsic_matrix", 9)
     K = flat.reshape(3, 3).T
     if min(K[0, 0], K[1, 1]) <= 0 or not np.array_equal(K[[1, 2, 2, 2], [0, 0, 1, 2]], [0, 0, 0, 1]):
         got, expected = flat.tolist(), "[fx, 0, 0, s, fy, 0, cx, cy, 1], column by column as Open3D writes it"
-        raise RecordingError(f"{fields.at('intrinsic_matrix')} is no camera matrix", got=got, expected=expected)
-    width, height = fields.whole("width"), fields.whole("height")
+        raise RecordingError(f"{fields.location('intrinsic_matrix')} is no camera matrix", got=got, expected=expected)
+    width, height = fields.whole_number("width"), fields.whole_number("height")
     if not (0 < K[0, 2] < width and 0 < K[1, 2] < height):
         got = f"principal point {K[:2, 2].tolist()} in {width} x {height} pixels"
-        raise RecordingError(f"{fields.at('intrinsic_matrix')} looks away from the image", got=got)
+        raise RecordingError(f"{fields.location('intrinsic_matrix')} looks away from the image", got=got)
     known: dict[str, Any] = {"width": width, "height": height, "K": K}
-    units = fields.maybe(fields.number, "depth_scale", above=0, most=1e6, suspect="metres per unit")
+    units = fields.optional(fields.number, "depth_scale", above=0, maximum=1e6, suspect="metres per unit")
     if units is not None:
         known["depth_scale"] = 1 / units  # Open3D stores units per metre
-    rate = fields.maybe(fields.number, "fps", above=0, most=1000, suspect="milliseconds")
+    rate = fields.optional(fields.number, "fps", above=0, maximum=1000, suspect="milliseconds")
     if rate is not None and fps is not None and rate != fps:
         raise RecordingError("source.fps contradicts the file", got=fps, expected=f"{rate:g}", remedy="leave it out")
     return ImportedCamera(known), rate or fps
@@ -140,19 +157,22 @@ def _times(paths: list[Path], fps: float | None) -> np.ndarray:
     if fps is None:
         expected = 'the scene with "source": {"fps": 30}'
         raise RecordingError(f"{paths[0].parent}: the images carry no times", expected=expected)
-    return np.round(np.arange(len(paths)) * (NANO / fps)).astype(np.int64)
+    return np.round(np.arange(len(paths)) * (NANOSECONDS_PER_SECOND / fps)).astype(np.int64)
 
 
 def _poses(log: Path, count: int) -> np.ndarray:
     """Camera-to-world poses [N, 4, 4]; each follows a line ``i j n``."""
-    lines = [line.split() for line in file_text(log).splitlines() if line.strip()]
+    lines = [line.split() for line in read_text(log).splitlines() if line.strip()]
     blocks = [lines[i : i + 5] for i in range(0, len(lines), 5)]
     try:
         heads = [[int(word) for word in block[0]] for block in blocks]
         poses = np.array([[[float(word) for word in row] for row in block[1:]] for block in blocks])
     except ValueError as error:
         raise RecordingError(f"{log} is damaged", got=error, expected="i j n and four rows of four numbers") from error
-    poses = checks.array(poses, str(log), (count, 4, 4))
+    poses = checks.check_array(poses, str(log), (count, 4, 4))
     if any(head[:2] != [i, i] for i, head in enumerate(heads)):
         raise RecordingError(f"{log} is not in order", expected=f"frames 0 to {count - 1}, one pose each")
     return poses
+
+
+REDWOOD_IMPORTER = Importer(REDWOOD_NAME, REDWOOD_TITLE, matches, read)

@@ -1,4 +1,4 @@
-"""ROS 2 bags: rosbag2 folders, .mcap and .db3 files. The scene says which topic is what.
+"""ROS 2 bags are read here: rosbag2 folders, .mcap and .db3 files. The scene says what each topic is.
 
     "source": {
       "motion": {"left": {"pose": "/left/pose", "closed": "/left/closed" | true, "wrench": "/left/ft",
@@ -8,15 +8,18 @@
       "points": {"topic": "/cloth", "frame": "world" | CAMERA},
       "epoch": 1700000000000000000}
 
-Poses, clouds and wrenches must be in the frame world or map, or their ``frame`` says where the scene places them.
-Times are those of measurement (header.stamp), and since ``epoch`` [ns] or the earliest one used; messages without a
-header (std_msgs) are placed by their time of logging. A value between two messages is interpolated for wrenches and
-held for ``closed``.
+Poses, clouds and wrenches must be in the frame world or map, or their ``frame`` names a camera or robot that the scene
+places. Times are those of measurement (header.stamp), relative to ``epoch`` [ns] or to the earliest one used. Messages
+without a header (std_msgs) are placed by their time of logging. Wrenches are interpolated between messages; ``closed``
+is constant until the next message.
 
-Checksums: in an MCAP file with checksums of its sections (our own writer's) any changed byte is noticed; with those of
-its chunks (as ROS 2 and the MCAP libraries write) any changed message. MCAP files by rosbags and all sqlite files carry
-none: structure, counts and times are checked, but a changed number or pixel goes unnoticed where it stays plausible.
-``source.checksums`` in the episode says which it was: "all bytes", "messages" or "none".
+Checksums: in an MCAP file with checksums of its sections (our own writer's) any changed byte is detected. With
+checksums of its chunks (as ROS 2 and the MCAP libraries write them) any changed message is. MCAP files by rosbags and
+all sqlite files carry none: structure, counts and times are checked, but a changed number or pixel goes unnoticed if it
+stays plausible. ``source.checksums`` in the episode says which it was: "all bytes", "messages" or "none".
+
+The work is shared: ``bag`` opens the files, ``ros2_messages`` decodes single messages, ``ros2_topics`` and
+``ros2_cameras`` collect those of one gripper or camera, ``embedded`` restores files by our own writer.
 """
 
 from __future__ import annotations
@@ -28,61 +31,70 @@ from typing import Any
 from ...errors import RecordingError
 from . import embedded
 from .bag import Bag, is_bag
-from .imported import Imported, nothing_left
+from .imported import Imported, Importer, reject_unknown_keys
 from .ros2_cameras import CameraTopics
 from .ros2_topics import CloudTopic, MotionTopics
-from .sidecar import Scene
+from .sidecar import Sidecar
 
-NAME = "ros2"
-TITLE = "ROS 2 bag (rosbag2 folder, .mcap, .db3)"
-UNCHECKED = {"all bytes": "", "messages": "", "none": "numbers and pixels"}
-EXAMPLE = '"source": {"motion": {"left": {"pose": TOPIC, "closed": true}}, "points": {"topic": TOPIC}}'
+ROS2_NAME = "ros2"
+ROS2_TITLE = "ROS 2 bag (rosbag2 folder, .mcap, .db3)"
+ROS2_UNCHECKED = {"all bytes": "", "messages": "", "none": "numbers and pixels"}
+ROS2_SOURCE_EXAMPLE = '"source": {"motion": {"left": {"pose": TOPIC, "closed": true}}, "points": {"topic": TOPIC}}'
 
 
 def matches(path: Path) -> bool:
-    """Whether it is a bag, by its content."""
+    """Return whether a path is a ROS 2 bag, by its content."""
     return is_bag(path)
 
 
-def read(path: Path, scene: Scene, episode: int | None) -> Imported:
-    """Read a bag; images are decoded when they are written."""
+def read(path: Path, scene: Sidecar, episode: int | None) -> Imported:
+    """Read a bag; images are decoded when they are written.
+
+    Args:
+        path: a rosbag2 folder, or a .mcap or .db3 file.
+        scene: the sidecar with ``source``.
+        episode: unused; a bag holds one episode.
+
+    Raises:
+        RecordingError: the bag is damaged, or the scene maps no topic or a wrong one.
+    """
     bag = Bag(path)
-    if embedded.SCENE in bag.types:
-        embedded.adopt(scene, bag)
+    if embedded.SCENE_TOPIC in bag.types:
+        embedded.adopt_sidecar(scene, bag)
     source = scene.source
-    if not source.rest:
+    if not source.remaining:
         got = ", ".join(f"{topic} ({kind.rpartition('/')[2]})" for topic, kind in sorted(bag.types.items()))
-        expected = f"the scene with {EXAMPLE}"
+        expected = f"the scene with {ROS2_SOURCE_EXAMPLE}"
         raise RecordingError(f"{path}: no topic is mapped", got=f"the topics {got}", expected=expected)
-    epoch = source.maybe(source.take, "epoch")
+    epoch = source.optional(source.take, "epoch")
     if epoch is not None and (isinstance(epoch, bool) or not isinstance(epoch, int) or abs(epoch) > 2**62):
-        raise RecordingError(f"{source.at('epoch')} is no time", got=epoch, expected="whole nanoseconds")
-    origin = source.maybe(source.take, "origin")
-    motion = {name: MotionTopics(fields, bag, scene) for name, fields in source.each("motion").items()}
-    each = source.each("cameras")
+        raise RecordingError(f"{source.location('epoch')} is no time", got=epoch, expected="whole nanoseconds")
+    origin = source.optional(source.take, "origin")
+    motion = {name: MotionTopics(fields, bag, scene) for name, fields in source.named_groups("motion").items()}
+    each = source.named_groups("cameras")
     cameras = {name: CameraTopics(fields, bag, scene.depth_scale(name)) for name, fields in each.items()}
-    clouds = CloudTopic(source.inside("points"), bag, scene) if source.has("points") else None
-    nothing_left(source)
+    clouds = CloudTopic(source.group("points"), bag, scene) if source.has("points") else None
+    reject_unknown_keys(source)
     parts = [*motion.values(), *cameras.values(), *([clouds] if clouds else [])]
-    _hand_out(bag, parts)
+    _distribute_messages(bag, parts)
     stamps = [stamp for part in parts for stamp in part.stamps()]
     start = epoch if epoch is not None else min(stamps, default=0)
-    found = Imported(
+    imported = Imported(
         motion={name: part.arrays(start) for name, part in motion.items()},
         points=clouds.arrays(start) if clouds else None,
         cameras={name: part.camera(start) for name, part in cameras.items()},
         notes={
-            "format": NAME,
+            "format": ROS2_NAME,
             "start_ns": start,
             "checksums": bag.checksums,
-            "unchecked": UNCHECKED[bag.checksums],
+            "unchecked": ROS2_UNCHECKED[bag.checksums],
             **({} if origin is None else {"origin": origin}),
         },
     )
-    return embedded.restore(found, scene)
+    return embedded.restore_files(imported, scene)
 
 
-def _hand_out(bag: Bag, parts: list[Any]) -> None:
+def _distribute_messages(bag: Bag, parts: list[Any]) -> None:
     """Give each message to the parts that named its topic."""
     takers: defaultdict[str, list[Any]] = defaultdict(list)
     for part in parts:
@@ -91,3 +103,6 @@ def _hand_out(bag: Bag, parts: list[Any]) -> None:
     for message in bag.messages(list(takers)):
         for part in takers[message.topic]:
             part.take(message)
+
+
+ROS2_IMPORTER = Importer(ROS2_NAME, ROS2_TITLE, matches, read)

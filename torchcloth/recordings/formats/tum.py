@@ -3,13 +3,13 @@
     rgb.txt, depth.txt    timestamp filename
     groundtruth.txt       timestamp tx ty tz qx qy qz qw    (camera to world; scalar last)
 
-Lines with ``#`` are comments. Depth is in 1/5000 m, unless the scene says otherwise. Colour and depth have clocks
-ticks of their own; a colour and a depth image that are each other's nearest within 20 ms share a frame number, every
-other image keeps one of its own. The layout holds no intrinsics: the scene gives them. ``"source": {"trajectory":
-"left", "closed": true}`` reads groundtruth.txt as the path of the gripper "left" instead, for those who track the hand.
+Lines with ``#`` are comments. Depth is in 1/5000 m, unless the scene says otherwise. Colour and depth have separate
+clock ticks: a colour and a depth image that are each other's nearest within 20 ms share a frame number, and every other
+image has its own. The layout holds no intrinsics: the scene gives them. ``"source": {"trajectory": "left", "closed":
+true}`` reads groundtruth.txt as the path of the gripper "left" instead, for those who track the hand.
 
-Text carries no checksum: a changed digit that stays plausible goes unnoticed, and so do changed bytes in the pixels
-of a JPEG; PNG files are verified.
+Text carries no checksum: a changed digit that stays plausible goes unnoticed, and so do changed bytes in the pixels of
+a JPEG. PNG files are verified.
 """
 
 from __future__ import annotations
@@ -20,103 +20,117 @@ import numpy as np
 
 from ...errors import RecordingError
 from .. import checks
-from ..images import ImageStream, Kind
+from ..images import ImageKind, ImageStream
 from .imported import (
-    LONGEST_NAME,
+    MAX_SHOWN_CHARACTERS,
     FileImages,
     Imported,
     ImportedCamera,
-    file_text,
-    fixed_pose,
-    frame_numbers,
+    Importer,
+    check_depth_scale,
     image_size,
-    nanoseconds,
-    nothing_left,
-    plausible,
-    pose_matrix,
-    seconds,
+    pair_frames,
+    parse_nanoseconds,
+    read_text,
+    reject_unknown_keys,
+    require_fixed_pose,
+    to_pose_matrices,
+    to_seconds,
 )
-from .sidecar import Scene
+from .sidecar import Sidecar
 
-NAME = "tum"
-TITLE = "TUM RGB-D folder"
-CAMERA = "cam0"
-UNCHECKED = "times, poses, and pixels of JPEG images"
-DEPTH_SCALE = 1 / 5000  # m per unit, as the layout has it
-LISTS: dict[Kind, str] = {"color": "rgb.txt", "depth": "depth.txt"}
-TRUTH = "groundtruth.txt"
+TUM_NAME = "tum"
+TUM_TITLE = "TUM RGB-D folder"
+TUM_CAMERA_NAME = "cam0"
+TUM_UNCHECKED = "times, poses, and pixels of JPEG images"
+TUM_DEPTH_SCALE_M = 1 / 5000  # per unit, by definition of the layout
+IMAGE_LIST_FILES: dict[ImageKind, str] = {"color": "rgb.txt", "depth": "depth.txt"}
+GROUND_TRUTH_FILE = "groundtruth.txt"
 
 
 def matches(path: Path) -> bool:
-    """Whether the folder is laid out like this."""
-    return all((path / file).is_file() for file in LISTS.values())
+    """Return whether a folder has this layout."""
+    return all((path / file).is_file() for file in IMAGE_LIST_FILES.values())
 
 
-def read(path: Path, scene: Scene, episode: int | None) -> Imported:
-    """Read the folder; the images are checked when they are copied."""
+def read(path: Path, scene: Sidecar, episode: int | None) -> Imported:
+    """Read the folder; the images are checked when they are copied.
+
+    Args:
+        path: the folder.
+        scene: the sidecar.
+        episode: unused; a folder holds one episode.
+
+    Raises:
+        RecordingError: the folder is damaged or incomplete.
+    """
     source = scene.source
-    name = source.maybe(source.text, "camera") or CAMERA
-    hand = source.maybe(source.text, "trajectory")
-    closed = source.maybe(source.take, "closed") if hand is not None else None
-    nothing_left(source)
-    lists: dict[Kind, list[tuple[int, Path]]] = {kind: _list(path, file) for kind, file in LISTS.items()}
-    stamps: dict[Kind, np.ndarray] = {
+    name = source.optional(source.text, "camera") or TUM_CAMERA_NAME
+    hand = source.optional(source.text, "trajectory")
+    closed = source.optional(source.take, "closed") if hand is not None else None
+    reject_unknown_keys(source)
+    lists: dict[ImageKind, list[tuple[int, Path]]] = {
+        kind: _list(path, file) for kind, file in IMAGE_LIST_FILES.items()
+    }
+    stamps: dict[ImageKind, np.ndarray] = {
         kind: np.array([ns for ns, _ in rows], dtype=np.int64) for kind, rows in lists.items()
     }
-    truth = _truth(path / TRUTH) if (path / TRUTH).is_file() else None
+    truth = _truth(path / GROUND_TRUTH_FILE) if (path / GROUND_TRUTH_FILE).is_file() else None
     start = int(min(t[0] for t in stamps.values()))
-    numbers: dict[Kind, np.ndarray] = {}
-    numbers["color"], numbers["depth"] = frame_numbers(stamps["color"], stamps["depth"])
+    numbers: dict[ImageKind, np.ndarray] = {}
+    numbers["color"], numbers["depth"] = pair_frames(stamps["color"], stamps["depth"])
     size = image_size(lists["depth"][0][1])
-    scale = scene.depth_scale(name) or DEPTH_SCALE
+    scale = scene.depth_scale(name) or TUM_DEPTH_SCALE_M
     camera = ImportedCamera({"width": size[0], "height": size[1], "depth_scale": scale})
     for kind, rows in lists.items():
         source_of = FileImages([file for _, file in rows])
-        camera.streams[kind] = ImageStream(kind, numbers[kind], seconds(stamps[kind], start), (), size, source_of)
-    plausible(camera.streams["depth"], scale, lists["depth"][0][1])
-    found = Imported(cameras={name: camera}, notes={"format": NAME, "start_ns": start, "unchecked": UNCHECKED})
+        camera.streams[kind] = ImageStream(kind, numbers[kind], to_seconds(stamps[kind], start), (), size, source_of)
+    check_depth_scale(camera.streams["depth"], scale, lists["depth"][0][1])
+    imported = Imported(
+        cameras={name: camera}, notes={"format": TUM_NAME, "start_ns": start, "unchecked": TUM_UNCHECKED}
+    )
     if truth is not None and hand is None:
-        remedy = f'if {TRUTH} tracks a gripper, write "source": {{"trajectory": "left", "closed": true}}'
-        poses = pose_matrix(truth[1], truth[2], str(path / TRUTH))
-        camera.known["T_world_camera"] = fixed_pose(poses, str(path / TRUTH), remedy=remedy)
+        remedy = f'if {GROUND_TRUTH_FILE} tracks a gripper, write "source": {{"trajectory": "left", "closed": true}}'
+        poses = to_pose_matrices(truth[1], truth[2], str(path / GROUND_TRUTH_FILE))
+        camera.calibration["T_world_camera"] = require_fixed_pose(poses, str(path / GROUND_TRUTH_FILE), remedy=remedy)
     elif truth is not None and hand is not None:
         if not isinstance(closed, bool):
-            raise RecordingError(f"{source.at('closed')} is unclear", got=closed, expected="true or false")
-        t = seconds(truth[0], start)
-        found.motion[hand] = {"t": t, "position": truth[1], "quat_wxyz": truth[2], "closed": np.full(len(t), closed)}
+            raise RecordingError(f"{source.location('closed')} is unclear", got=closed, expected="true or false")
+        t = to_seconds(truth[0], start)
+        imported.motion[hand] = {"t": t, "position": truth[1], "quat_wxyz": truth[2], "closed": np.full(len(t), closed)}
     elif hand is not None:
-        raise RecordingError(f"{path / TRUTH} is missing", expected=f"the path of {hand!r}")
-    return found
+        raise RecordingError(f"{path / GROUND_TRUTH_FILE} is missing", expected=f"the path of {hand!r}")
+    return imported
 
 
 def _rows(file: Path, columns: int) -> list[list[str]]:
-    rows = [line.split() for line in file_text(file).splitlines() if line.strip() and not line.lstrip().startswith("#")]
+    rows = [line.split() for line in read_text(file).splitlines() if line.strip() and not line.lstrip().startswith("#")]
     wrong = next((row for row in rows if len(row) != columns), None)
     if not rows or wrong:
-        got = "no line" if not rows else repr(" ".join(wrong or [])[:LONGEST_NAME])
+        got = "no line" if not rows else repr(" ".join(wrong or [])[:MAX_SHOWN_CHARACTERS])
         raise RecordingError(f"{file} is damaged", got=got, expected=f"lines of {columns} words")
     return rows
 
 
 def _stamps(rows: list[list[str]], file: Path) -> np.ndarray:
-    stamps = np.array([nanoseconds(row[0], str(file)) for row in rows], dtype=np.int64)
-    checks.increasing(seconds(stamps, int(stamps[0])), str(file))
+    stamps = np.array([parse_nanoseconds(row[0], str(file)) for row in rows], dtype=np.int64)
+    checks.check_increasing(to_seconds(stamps, int(stamps[0])), str(file))
     return stamps
 
 
 def _list(folder: Path, name: str) -> list[tuple[int, Path]]:
-    """Time and path of each image; a path may not leave the folder, and no image may stand twice."""
+    """Time and path of each image; a path may not leave the folder, and no image may occur twice."""
     rows = _rows(folder / name, 2)
     files = [row[1] for row in rows]
-    strange = next((f for f in files if Path(f).is_absolute() or ".." in Path(f).parts or "\0" in f), None)
-    if strange is not None or len(set(files)) < len(files):
-        got = strange or "a file listed twice"
+    outside = next((f for f in files if Path(f).is_absolute() or ".." in Path(f).parts or "\0" in f), None)
+    if outside is not None or len(set(files)) < len(files):
+        got = outside or "a file listed twice"
         raise RecordingError(f"{folder / name} names wrong files", got=repr(got), expected="images below the folder")
     parents = {((folder / f).parent, Path(f).suffix) for f in files}
-    beside = {p for parent, suffix in parents for p in parent.glob("*") if p.suffix == suffix}
-    forgotten = sorted(beside - {folder / f for f in files})
-    if forgotten:
-        got, expected = f"{forgotten[0].name} not listed", "every image; the list may have been cut"
+    images = {p for parent, suffix in parents for p in parent.glob("*") if p.suffix == suffix}
+    unlisted = sorted(images - {folder / f for f in files})
+    if unlisted:
+        got, expected = f"{unlisted[0].name} not listed", "every image; the list may have been cut"
         raise RecordingError(f"{folder / name} is incomplete", got=got, expected=expected, remedy="list or remove it")
     return list(zip(_stamps(rows, folder / name).tolist(), (folder / f for f in files), strict=True))
 
@@ -128,8 +142,11 @@ def _truth(file: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         values = np.array([[float(word) for word in row[1:]] for row in rows])
     except ValueError as error:
         raise RecordingError(f"{file} is damaged", got=error, expected="numbers") from error
-    values = checks.array(values, str(file), ("N", 7))
-    checks.metres(values[:, :3], str(file))
+    values = checks.check_array(values, str(file), ("N", 7))
+    checks.check_metres(values[:, :3], str(file))
     quat = values[:, [6, 3, 4, 5]]
-    checks.unit(quat, str(file))
+    checks.normalise_unit(quat, str(file))
     return _stamps(rows, file), values[:, :3], quat
+
+
+TUM_IMPORTER = Importer(TUM_NAME, TUM_TITLE, matches, read)

@@ -1,8 +1,8 @@
-"""Frames of a video track by PyAV, each held against the time it must have.
+"""Frames of a video track by PyAV, each checked against its expected time.
 
-What can be noticed: packets and frames that the decoder flags, errors that FFmpeg only logs, checksums where the
-codec has them (FFV1 with slicecrc), frames that are missing, too many or at another time. What cannot: changed bytes
-that decode to another picture, in codecs without checksums (raw video, JPEG, H.264, AV1).
+Detected are: packets and frames that the decoder flags, errors that FFmpeg only logs, checksums if the codec has them
+(FFV1 with slicecrc), and frames that are missing, too many or at another time. Changed bytes that decode to another
+picture are not detected in codecs without checksums (raw video, JPEG, H.264, AV1).
 """
 
 from __future__ import annotations
@@ -15,36 +15,36 @@ from typing import Any
 import numpy as np
 
 from ...errors import MissingDependency, RecordingError
-from ..images import ImageSource, Kind
-from .imported import damaged
+from ..images import ImageKind, ImageSource
+from .imported import report_damage
 
-STRICT = {"err_detect": "crccheck+bitstream+buffer+explode"}
-SEEK = 2 * 10**9  # ns; before this, decoding from the start is as quick
-FORMATS = {"depth": "gray16le", "color": "rgb24", "mask": "gray"}
+STRICT_DECODER_OPTIONS = {"err_detect": "crccheck+bitstream+buffer+explode"}
+MIN_SEEK_TIME_NS = 2 * 10**9  # before this, decoding from the start is as fast
+PIXEL_FORMATS = {"depth": "gray16le", "color": "rgb24", "mask": "gray"}
 
 
 class VideoFrames(ImageSource):
-    """The frames of one track whose times are these.
+    """The frames of one track at given times.
 
     Args:
         path: the video file.
         track: number of the stream in it.
         kind: what they show; depth must be 16-bit grey.
-        times: [N] ns from the start of the file.
-        tolerance: by which a frame's time may differ [ns].
+        times: [N] ns, from the start of the file.
+        tolerance: ns, by which a frame's time may differ.
     """
 
-    def __init__(self, path: Path, track: int, kind: Kind, times: np.ndarray, tolerance: int) -> None:
+    def __init__(self, path: Path, track: int, kind: ImageKind, times: np.ndarray, tolerance: int) -> None:
         self.path, self.track, self.kind = path, track, kind
         self.times, self.tolerance = times, tolerance
 
     def __iter__(self) -> Iterator[np.ndarray]:
-        with opened(self.path) as container, listening(self.path):
-            with damaged(self.path, "video"):
+        with open_video(self.path) as container, reject_logged_errors(self.path):
+            with report_damage(self.path, "video"):
                 stream = container.streams[self.track]
-                stream.codec_context.options = STRICT
-                if self.times[0] > SEEK:
-                    container.seek(int(self.times[0] - SEEK // 2) // 1000)
+                stream.codec_context.options = STRICT_DECODER_OPTIONS
+                if self.times[0] > MIN_SEEK_TIME_NS:
+                    container.seek(int(self.times[0] - MIN_SEEK_TIME_NS // 2) // 1000)
             i = 0
             for ns, frame in self._frames(container, stream):
                 if ns < self.times[0] - self.tolerance:
@@ -60,10 +60,10 @@ class VideoFrames(ImageSource):
             raise RecordingError(f"{self.path} ends early", got=got, expected=expected, remedy="copy it again")
 
     def _frames(self, container: Any, stream: Any) -> Iterator[tuple[int, Any]]:
-        """Time [ns] and frame, of all that decode without complaint."""
+        """Time [ns] and frame, for all frames that decode without an error."""
         packets = container.demux(stream)
         while True:
-            with damaged(self.path, "video"):
+            with report_damage(self.path, "video"):
                 packet = next(packets, None)
                 if packet is None:
                     return
@@ -79,18 +79,23 @@ class VideoFrames(ImageSource):
         if (self.kind == "depth") != frame.format.name.startswith("gray16"):
             expected = "16-bit grey" if self.kind == "depth" else "colour"
             raise RecordingError(f"{self.path} holds other pixels", got=frame.format.name, expected=expected)
-        with damaged(self.path, "video"):
-            return frame.to_ndarray(format=FORMATS[self.kind])
+        with report_damage(self.path, "video"):
+            return frame.to_ndarray(format=PIXEL_FORMATS[self.kind])
 
 
 @contextmanager
-def opened(path: Path) -> Iterator[Any]:
-    """The container of a video file."""
+def open_video(path: Path) -> Iterator[Any]:
+    """Open the container of a video file.
+
+    Raises:
+        MissingDependency: PyAV is not installed.
+        RecordingError: the file cannot be opened.
+    """
     try:
         import av  # pyright: ignore[reportMissingImports]  (optional)
     except ImportError as error:
         raise MissingDependency("reading video needs PyAV", remedy='pip install "torchcloth[data]"') from error
-    with damaged(path, "video"):
+    with report_damage(path, "video"):
         container = av.open(str(path))
     try:
         yield container
@@ -99,26 +104,26 @@ def opened(path: Path) -> Iterator[Any]:
 
 
 @contextmanager
-def listening(path: Path) -> Iterator[None]:
-    """Refuse the file when FFmpeg logs an error inside: it would go on past damage and leave frames out."""
+def reject_logged_errors(path: Path) -> Iterator[None]:
+    """Refuse the file if FFmpeg logs an error inside: it would continue past damage and skip frames."""
     import av.logging  # pyright: ignore[reportMissingImports]
 
     before = av.logging.get_level()
     av.logging.set_level(av.logging.ERROR)
     try:
-        with av.logging.Capture(local=False) as heard:  # decoders have threads of their own
+        with av.logging.Capture(local=False) as log:  # decoders have their own threads
             yield
-            said = [text.strip() for level, _, text in heard if level <= av.logging.ERROR]
+            errors = [text.strip() for level, _, text in log if level <= av.logging.ERROR]
     finally:
         av.logging.set_level(before)
-    if said:
-        raise RecordingError(f"{path} is damaged", got=said[0][:120], remedy="copy or record it again")
+    if errors:
+        raise RecordingError(f"{path} is damaged", got=errors[0][:120], remedy="copy or record it again")
 
 
-def packet_times(path: Path) -> dict[int, np.ndarray]:
-    """Times [N] ns of the packets of each track in the order of the file, from its start, without decoding them."""
+def read_packet_times(path: Path) -> dict[int, np.ndarray]:
+    """Read the times [N] ns of the packets of each track in the order of the file, from its start, without decoding."""
     times: dict[int, list[int]] = {}
-    with opened(path) as container, listening(path), damaged(path, "video"):
+    with open_video(path) as container, reject_logged_errors(path), report_damage(path, "video"):
         for packet in container.demux():
             if packet.size:
                 if packet.pts is None or packet.is_corrupt:

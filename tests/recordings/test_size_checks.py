@@ -11,7 +11,7 @@ import pytest
 from torchcloth import meshes
 from torchcloth import recordings as rec
 from torchcloth.errors import RecordingError
-from torchcloth.recordings.size_checks import check_size, of_another_size, size
+from torchcloth.recordings.size_checks import check_size, cloth_size, detect_wrong_size
 
 FRAMES, POINTS = 5, 60
 
@@ -31,9 +31,9 @@ def times(recording, factor):
 
 def test_the_unit_is_guessed(sheet):
     check_size(sheet)
-    for factor, said in ((1e-3, r"the cloud is 0\.00\d+ times as long as the cloth;"), (39.4, "as if in inches")):
+    for factor, message in ((1e-3, r"the cloud is 0\.00\d+ times as long as the cloth;"), (39.4, "as if in inches")):
         with pytest.raises(
-            RecordingError, match=f"recording: .*{said}.*expected points of the cloth, in metres; check"
+            RecordingError, match=f"recording: .*{message}.*expected points of the cloth, in metres; check"
         ):
             check_size(times(sheet, factor))
 
@@ -41,8 +41,8 @@ def test_the_unit_is_guessed(sheet):
 def test_a_few_points_show_no_size(sheet):
     """One marker has none, nor has a cloth of unknown size."""
     first = rec.PointClouds(sheet.points.t, np.ones((FRAMES, 3)), np.ones(FRAMES, int))
-    assert of_another_size(replace(sheet, points=first)) is None
-    assert of_another_size(replace(times(sheet, 1e3), cloth=rec.ClothInfo(areal_density=0.2))) is None
+    assert detect_wrong_size(replace(sheet, points=first)) is None
+    assert detect_wrong_size(replace(times(sheet, 1e3), cloth=rec.ClothInfo(areal_density=0.2))) is None
 
 
 def test_a_cloth_that_lies_folded_is_as_long_as_its_pattern():
@@ -51,12 +51,14 @@ def test_a_cloth_that_lies_folded_is_as_long_as_its_pattern():
     folded[:, 0] = np.abs(folded[:, 0] - 0.15)
     info = partial(rec.ClothInfo, areal_density=0.2, faces=mesh.faces)
     for uv in (mesh.uv, mesh.pattern):
-        assert size(info(vertices=folded, uv=uv)) == pytest.approx((0.3 * 2**0.5, 0.09))
-    assert size(info(vertices=folded)) == pytest.approx((np.hypot(0.15, 0.3), 0.09))  # all that is known of it
-    assert size(info(vertices=mesh.vertices, uv=mesh.uv + 5.0)) == pytest.approx((0.3 * 2**0.5, 0.09))
+        assert cloth_size(info(vertices=folded, uv=uv)) == pytest.approx((0.3 * 2**0.5, 0.09))
+    assert cloth_size(info(vertices=folded)) == pytest.approx((np.hypot(0.15, 0.3), 0.09))  # all that is known of it
+    assert cloth_size(info(vertices=mesh.vertices, uv=mesh.uv + 5.0)) == pytest.approx((0.3 * 2**0.5, 0.09))
 
 
 def test_panels_that_lie_apart_in_the_pattern_are_no_longer_for_it():
     shirt = meshes.shirt()
-    found, _ = size(rec.ClothInfo(areal_density=0.2, vertices=shirt.vertices, faces=shirt.faces, uv=shirt.pattern))
-    assert found == pytest.approx(np.linalg.norm(np.ptp(shirt.vertices, axis=0)))
+    result, _ = cloth_size(
+        rec.ClothInfo(areal_density=0.2, vertices=shirt.vertices, faces=shirt.faces, uv=shirt.pattern)
+    )
+    assert result == pytest.approx(np.linalg.norm(np.ptp(shirt.vertices, axis=0)))

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from torchcloth.errors import InvalidInput
-from torchcloth.recordings.fingerprints import alike, each_once, mark
+from torchcloth.recordings.fingerprints import fingerprint, reject_duplicates, same_episode
 
 
 def noisy(recording, noise):
@@ -18,21 +18,21 @@ def noisy(recording, noise):
 def test_one_episode_twice_is_refused_under_any_name(recording, tmp_path):
     copy = replace(recording, path=tmp_path / "copy", clock_offset=0.0)
     with pytest.raises(InvalidInput, match="'recording' and 'copy', which hold the same; expected each once"):
-        each_once([recording, noisy(recording, 0.01), copy])
+        reject_duplicates([recording, noisy(recording, 0.01), copy])
     with pytest.raises(InvalidInput, match="episodes; got 'copy' twice; expected each once; leave one out"):
-        each_once([copy, copy])
+        reject_duplicates([copy, copy])
 
 
 def test_noise_of_its_own_makes_a_repetition_even_where_its_mean_is_nothing(recording):
     noise = np.random.default_rng(1).normal(0, 1e-3, recording.points.xyz.shape)
     other = noisy(recording, noise - noise.mean(0))
-    assert alike(mark(recording), mark(other))
-    each_once([recording, other])
+    assert same_episode(fingerprint(recording), fingerprint(other))
+    reject_duplicates([recording, other])
 
 
 def test_forces_are_told_apart_where_nothing_was_seen(recording):
     felt = replace(recording, points=None, markers=None)
     with pytest.raises(InvalidInput, match="twice"):
-        each_once([felt, felt])
+        reject_duplicates([felt, felt])
     blind = replace(felt, grippers={}, joints={})
-    each_once([blind, blind])  # that there is nothing is said elsewhere
+    reject_duplicates([blind, blind])  # that there is nothing is said elsewhere
