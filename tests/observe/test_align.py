@@ -60,13 +60,13 @@ def rms(error: np.ndarray) -> float:
     return float(np.sqrt((error**2).sum(-1).mean()))
 
 
-def check(scene: Scene, found, hidden: float, seen: float = 2.5 * NOISE) -> None:
-    error = found.x.numpy() - scene.x
+def check(scene: Scene, result, hidden: float, seen: float = 2.5 * NOISE) -> None:
+    error = result.x.numpy() - scene.x
     front = np.unique(scene.mesh.faces[: len(scene.mesh.faces) // 2])
     along = error @ scene.normal
-    assert found.rms == pytest.approx(NOISE, rel=0.25)
-    assert found.coverage > 0.95
-    assert found.strain < 0.03
+    assert result.rms == pytest.approx(NOISE, rel=0.25)
+    assert result.coverage > 0.95
+    assert result.strain < 0.03
     assert np.sqrt((along[front] ** 2).mean()) < NOISE
     assert rms(error[front]) < seen
     assert rms(error) < hidden
@@ -76,11 +76,11 @@ def check(scene: Scene, found, hidden: float, seen: float = 2.5 * NOISE) -> None
 def test_a_bent_shirt_comes_back_to_the_noise(render, axis, angle):
     """Rigid motions alone leave 20 mm. The side that no point shows follows the one that points show."""
     scene = seen(render, tc.meshes.shirt(triangles=300), turned(axis, angle))
-    found = align(scene.mesh, scene.cloud, viewpoint=scene.eye, noise=NOISE)
-    check(scene, found, hidden=2.5 * NOISE)
-    rigid = scene.mesh.vertices @ found.pose[:3, :3].numpy().T + found.pose[:3, 3].numpy()
+    result = align(scene.mesh, scene.cloud, viewpoint=scene.eye, noise=NOISE)
+    check(scene, result, hidden=2.5 * NOISE)
+    rigid = scene.mesh.vertices @ result.pose[:3, :3].numpy().T + result.pose[:3, 3].numpy()
     assert rms(rigid - scene.x) > 0.015
-    torch.testing.assert_close(found.pose[:3, :3] @ found.pose[:3, :3].mT, torch.eye(3, dtype=torch.float64))
+    torch.testing.assert_close(result.pose[:3, :3] @ result.pose[:3, :3].mT, torch.eye(3, dtype=torch.float64))
 
 
 @pytest.mark.slow
@@ -88,8 +88,8 @@ def test_a_bent_shirt_comes_back_to_the_noise(render, axis, angle):
 @pytest.mark.parametrize("name", ["shirt", "trousers", "dress"])
 def test_garments_of_full_size_come_back(render, name, angle):
     scene = seen(render, getattr(tc.meshes, name)(), turned((0.1, 0, 1), angle), points=3000)
-    found = align(scene.mesh, scene.cloud, viewpoint=scene.eye, noise=NOISE)
-    check(scene, found, hidden=3 * NOISE, seen=3 * NOISE)  # within the surface nothing but the outline holds it
+    result = align(scene.mesh, scene.cloud, viewpoint=scene.eye, noise=NOISE)
+    check(scene, result, hidden=3 * NOISE, seen=3 * NOISE)  # within the surface nothing but the outline holds it
 
 
 def test_a_part_that_something_hides_follows_the_rest(render):
@@ -97,9 +97,9 @@ def test_a_part_that_something_hides_follows_the_rest(render):
     scene = seen(render, tc.meshes.shirt(triangles=300), np.eye(3))
     across = scene.cloud[:, 1] - scene.x[:, 1].mean()
     partial = scene.cloud[np.abs(across + 0.1) > 0.06]
-    found = align(scene.mesh, partial, viewpoint=scene.eye, noise=NOISE)
-    assert 0.7 < found.coverage < 0.95
-    assert rms(found.x.numpy() - scene.x) < 4 * NOISE
+    result = align(scene.mesh, partial, viewpoint=scene.eye, noise=NOISE)
+    assert 0.7 < result.coverage < 0.95
+    assert rms(result.x.numpy() - scene.x) < 4 * NOISE
 
 
 def test_a_sheet_without_a_viewpoint():
@@ -109,10 +109,10 @@ def test_a_sheet_without_a_viewpoint():
     inside = rng.uniform(0, [0.5, 0.3], (800, 2))
     R = turned((0, 0, 1), 0.4)
     cloud = np.column_stack([inside, np.zeros(800)]) @ R.T + [0.2, 0.1, 0.7] + rng.normal(0, 1e-3, (800, 3))
-    found = align(mesh, torch.as_tensor(cloud, dtype=torch.float32).requires_grad_(), noise=1e-3)
+    result = align(mesh, torch.as_tensor(cloud, dtype=torch.float32).requires_grad_(), noise=1e-3)
     truth = mesh.vertices @ R.T + [0.2, 0.1, 0.7]
-    assert rms(found.x.numpy() - truth) < 0.004
-    assert found.strain < 0.01
+    assert rms(result.x.numpy() - truth) < 0.004
+    assert result.strain < 0.01
 
 
 def test_a_single_triangle_has_no_hinge():

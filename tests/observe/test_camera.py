@@ -43,13 +43,13 @@ def test_the_d435_s_field_of_view_is_the_maker_s():
 
 
 def test_a_recorded_camera_and_back(camera):
-    recorded = recordings.Camera(**camera.calibration(), depth_scale=0.001)
-    again = DepthCamera.of(recorded, camera.range)
-    np.testing.assert_array_equal(again.grid, camera.grid)
+    recorded = recordings.Camera(**camera.to_calibration(), depth_scale=0.001)
+    again = DepthCamera.from_recording(recorded, camera.range)
+    np.testing.assert_array_equal(again.pixel_rays, camera.pixel_rays)
     points = np.random.default_rng(0).uniform(-0.3, 0.3, (20, 3))
     np.testing.assert_array_equal(again.project(points)[0], camera.project(points)[0])
     assert again.range == (0.5, 3.86)
-    assert camera.rectified().lens.plain
+    assert camera.without_distortion().lens.is_identity
 
 
 @pytest.mark.parametrize(

@@ -91,8 +91,8 @@ def test_every_pixel_of_the_kinect_and_back():
 
 
 def test_the_kinect_s_field_of_view_is_the_maker_s_75_by_65_degrees():
-    across = np.rad2deg(np.arctan(KINECT.grid[328, [0, -1], 0]))
-    down = np.rad2deg(np.arctan(KINECT.grid[[0, -1], 321, 1]))
+    across = np.rad2deg(np.arctan(KINECT.pixel_rays[328, [0, -1], 0]))
+    down = np.rad2deg(np.arctan(KINECT.pixel_rays[[0, -1], 321, 1]))
     # this device's image is 73.1 by 65.7 degrees along its axes; without the lens it would be 64.8 by 59.2
     assert np.ptp(across) == pytest.approx(75, abs=2)
     assert np.ptp(down) == pytest.approx(65, abs=2)
@@ -101,7 +101,7 @@ def test_the_kinect_s_field_of_view_is_the_maker_s_75_by_65_degrees():
 def test_where_the_image_folds_back_there_is_no_ray():
     lens = Lens((-0.3, 0.0, 0.0, 0.0))  # r (1 - 0.3 r^2) turns at r = 1.054, where it is 0.703
     turn = np.sqrt(1 / 0.9)
-    assert lens.limit == pytest.approx(turn, abs=2.6e-3)  # one sample
+    assert lens.max_radius == pytest.approx(turn, abs=2.6e-3)  # one sample
     inner, outer = lens.distort(np.array([[1.0, 0.0], [1.2, 0.0]]))
     np.testing.assert_allclose(inner, [0.7, 0.0])
     assert np.isnan(outer).all()  # it falls at 0.68, where a ray at 0.93 falls too
@@ -114,7 +114,7 @@ def test_pixels_without_a_ray_give_no_points_and_see_nothing(render, rectangle):
     camera = DepthCamera(
         200, 100, np.array([[80.0, 0, 99.5], [0, 80, 49.5], [0, 0, 1]]), np.eye(4), distortion=[-0.3, 0, 0, 0]
     )
-    blind = np.isnan(camera.grid[..., 0])
+    blind = np.isnan(camera.pixel_rays[..., 0])
     assert 0.3 < blind.mean() < 0.6
     depth, ids = render_depth(camera, [rectangle(-5, 5, -5, 5, 1.0)])
     np.testing.assert_array_equal(depth == 0, blind)

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from torchcloth.errors import InvalidInput
-from torchcloth.observe import DepthNoise, StereoNoise, lost_edges
+from torchcloth.observe import DepthNoise, StereoNoise, mask_depth_edges
 
 
 @pytest.mark.parametrize("z", [0.4, 1.0, 2.5])
@@ -47,7 +47,7 @@ def test_a_step_in_depth_is_lost_and_invalid_stays_invalid():
 def test_a_missing_neighbour_is_no_edge():
     depth = np.full((5, 5), 2.0)
     depth[2, 2] = 0.0
-    assert not lost_edges(depth, 0.8).any()
+    assert not mask_depth_edges(depth, 0.8).any()
 
 
 def test_jitter_invents_no_points_between_two_surfaces():
@@ -80,7 +80,7 @@ def test_illegal_parameters_are_refused():
 def test_flying_pixels_lie_between_both_sides_of_an_edge_only():
     depth = np.full((200, 40), 1.0, np.float32)
     depth[:, 20:] = 1.5
-    noise = DepthNoise(sigma_base=0.0, sigma_slope=0.0, jitter=0.0, flying=0.5)
+    noise = DepthNoise(sigma_base=0.0, sigma_slope=0.0, jitter=0.0, flying_fraction=0.5)
     flown = noise.apply(depth, np.random.default_rng(0))
     between = (flown > 1.001) & (flown < 1.499)
     assert not between[:, :19].any()
@@ -97,7 +97,7 @@ def test_the_kinect_s_bias_keeps_within_the_maker_s_bound():
         errors.append(quiet.apply(depth, rng, quiet.bias_field(depth.shape, rng))[::40, ::40] - 2)
     inside = np.abs(errors) < 0.011 + 0.001 * 2
     assert inside.mean() == pytest.approx(0.954, abs=0.03)  # two standard deviations
-    assert not noise.without_bias().biased
+    assert not noise.without_bias().has_bias
 
 
 def test_a_bias_of_another_camera_is_refused_and_far_depths_are_none():

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from torchcloth.errors import InvalidInput, MissingDependency
-from torchcloth.observe import DepthCamera, look_at, render_depth, solid_mesh, to_points
+from torchcloth.observe import DepthCamera, build_solid_mesh, look_at, render_depth, to_points
 
 KINECT = DepthCamera.azure_kinect_nfov(np.eye(4))
 
@@ -17,7 +17,7 @@ def test_a_plane_has_its_depth_at_every_pixel(render, rectangle):
 
 
 def test_a_tilted_plane_has_the_depth_of_the_ray_plane_intersection(render, rectangle):
-    camera = KINECT.rectified()
+    camera = KINECT.without_distortion()
     depth, _ = render(camera, [rectangle(-5, 5, -5, 5, 1.5, tilt=0.4)])
     slope = (np.arange(640) - camera.K[0, 2]) / camera.K[0, 0]
     expected = 1.5 / (1 - 0.4 * slope)  # z = 1.5 + 0.4 x with x = slope z
@@ -37,7 +37,7 @@ def test_a_world_pose_and_both_sides(render):
 
 
 def test_an_occluder_takes_points_away_and_is_named(render, rectangle):
-    sheet, box = rectangle(-0.3, 0.3, -0.3, 0.3, 1.5), solid_mesh("box", (0.1, 0.1, 0.1), _at(0, 0, 1.0))
+    sheet, box = rectangle(-0.3, 0.3, -0.3, 0.3, 1.5), build_solid_mesh("box", (0.1, 0.1, 0.1), _at(0, 0, 1.0))
     free = render(KINECT, [sheet])[1] == 0
     depth, ids = render(KINECT, [sheet, box])
     assert (ids == 1).any()

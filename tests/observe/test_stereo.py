@@ -5,7 +5,7 @@ import pytest
 
 from torchcloth.errors import InvalidInput
 from torchcloth.observe import StereoNoise
-from torchcloth.observe.stereo import patches, shadow
+from torchcloth.observe.stereo import draw_patch_noise, mask_stereo_shadow
 
 FB = 424 * 0.05  # px m
 QUIET = StereoNoise(subpixel=0.0, step=0.0, holes=0.0, fattening=0)
@@ -32,9 +32,9 @@ def test_errors_are_alike_within_a_patch():
     noise = StereoNoise(step=0.0, holes=0.0, patch=3.0)
     error = (noise.apply(np.full((240, 400), 1.0, np.float32), np.random.default_rng(1)) - 1)[:, 40:]
     for lag in (1, 3, 6):
-        found = (error[:, :-lag] * error[:, lag:]).mean() / error.var()
-        assert found == pytest.approx(np.exp(-(lag**2) / 4 / 9), abs=0.06)  # two Gaussians of 3 px
-    assert patches((64, 64), 0.0, np.random.default_rng(0)).std() == pytest.approx(1, abs=0.05)
+        result = (error[:, :-lag] * error[:, lag:]).mean() / error.var()
+        assert result == pytest.approx(np.exp(-(lag**2) / 4 / 9), abs=0.06)  # two Gaussians of 3 px
+    assert draw_patch_noise((64, 64), 0.0, np.random.default_rng(0)).std() == pytest.approx(1, abs=0.05)
 
 
 def test_disparities_come_in_steps():
@@ -55,7 +55,7 @@ def test_a_shadow_as_wide_as_the_step_in_disparity_falls_to_the_left():
     assert row[60:].all()
     assert row[int(FB / far) + 1 : 60 - int(band) - 2].all()
     assert not row[: int(FB / far)].any()  # out of the right imager's view: the invalid band
-    assert shadow(FB / step(near, far)).sum() == (~seen).sum()
+    assert mask_stereo_shadow(FB / step(near, far)).sum() == (~seen).sum()
 
 
 def test_a_near_surface_is_fattened_to_the_right_too():
@@ -67,8 +67,8 @@ def test_a_near_surface_is_fattened_to_the_right_too():
 
 def test_holes_have_their_share():
     noisy = replace(QUIET, holes=0.05, patch=2.0).apply(np.full((400, 800), 1.0, np.float32), np.random.default_rng(0))
-    lost = (noisy[:, 30:] == 0).mean()
-    assert lost == pytest.approx(0.05, abs=0.01)
+    missing = (noisy[:, 30:] == 0).mean()
+    assert missing == pytest.approx(0.05, abs=0.01)
 
 
 def test_the_bias_of_a_device_is_its_scale_and_its_warp():

@@ -7,11 +7,11 @@ from torchcloth.observe import (
     DepthNoise,
     StereoNoise,
     View,
+    build_solid_mesh,
+    build_solid_meshes,
     capture,
-    decode,
-    encode,
-    solid_mesh,
-    solid_meshes,
+    decode_depth,
+    encode_depth,
 )
 
 KINECT = DepthCamera.azure_kinect_nfov(np.eye(4))
@@ -32,9 +32,9 @@ class Solid:
 )
 def test_points_are_the_cloth_s_within_the_noise(render, rectangle, camera, noise):
     sheet = rectangle(-0.2, 0.2, -0.2, 0.2, 1.2)
-    view = View(camera, noise.without_bias(), rim=3)
+    view = View(camera, noise.without_bias(), mask_erosion=3)
     alone = capture(view, *sheet, rng=np.random.default_rng(0))
-    hidden = capture(view, *sheet, solid_meshes([Solid(0.8)], at=0), rng=np.random.default_rng(0))
+    hidden = capture(view, *sheet, build_solid_meshes([Solid(0.8)], at=0), rng=np.random.default_rng(0))
     assert hidden.depth.shape == hidden.mask.shape == (camera.height, camera.width)
     assert hidden.depth.dtype == np.float32
     assert 0.5 < len(hidden.points) / len(alone.points) < 0.95
@@ -58,7 +58,7 @@ def test_a_device_keeps_its_bias(render, rectangle):
 
 
 def test_an_ideal_sensor_and_few_points(render, rectangle):
-    view = View(KINECT, points=50)
+    view = View(KINECT, max_points=50)
     seen = capture(view, *rectangle(-0.2, 0.2, -0.2, 0.2, 1.2), rng=np.random.default_rng(0))
     assert len(seen.points) == 50
     np.testing.assert_allclose(seen.points[:, 2], 1.2, atol=1e-4)
@@ -69,17 +69,19 @@ def test_solids_of_a_moment():
     for k, height in enumerate((0.5, 0.9)):
         pose = np.eye(4)
         pose[2, 3] = height
-        np.testing.assert_array_equal(solid_meshes(solids, at=k)[0][0], solid_mesh("box", Solid.size, pose)[0])
+        np.testing.assert_array_equal(
+            build_solid_meshes(solids, at=k)[0][0], build_solid_mesh("box", Solid.size, pose)[0]
+        )
 
 
 def test_stored_and_read_again():
     depth = np.array([[0.0, 0.5004, 1.2345], [65.5, 70.0, np.nan]])
-    image = encode(depth)
+    image = encode_depth(depth)
     assert image.dtype == np.uint16
     np.testing.assert_array_equal(image, [[0, 500, 1234], [65500, 0, 0]])
-    np.testing.assert_allclose(decode(image)[0], [0, 0.5, 1.234], atol=1e-6)
-    np.testing.assert_allclose(decode(encode(depth, 1e-4), 1e-4)[0], [0, 0.5004, 1.2345], atol=6e-5)
+    np.testing.assert_allclose(decode_depth(image)[0], [0, 0.5, 1.234], atol=1e-6)
+    np.testing.assert_allclose(decode_depth(encode_depth(depth, 1e-4), 1e-4)[0], [0, 0.5004, 1.2345], atol=6e-5)
     with pytest.raises(InvalidInput, match="depth_scale"):
-        encode(depth, 0.0)
+        encode_depth(depth, 0.0)
     with pytest.raises(InvalidInput, match="whole numbers"):
-        encode(np.full((4, 4), 800, np.uint16))
+        encode_depth(np.full((4, 4), 800, np.uint16))

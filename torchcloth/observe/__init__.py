@@ -1,4 +1,4 @@
-"""Depth cameras: rendering, noise, masks and point clouds; and a mesh laid onto what they saw.
+"""Depth cameras: rendering, noise, segmentation and point clouds, and the alignment of a mesh to a cloud.
 
 To a camera a cloth is one more triangle mesh; only ``align`` knows its pattern.
 """
@@ -7,13 +7,13 @@ from .align import Alignment, align
 from .camera import DepthCamera, look_at
 from .cloud import erode, thin_to_count, thin_to_spacing, to_points
 from .lens import Lens
-from .noise import AbstractNoise, DepthNoise, lost_edges
-from .register import colors_at, reproject, steep
+from .noise import AbstractNoise, DepthNoise, mask_depth_edges
+from .register import mask_steep_pixels, reproject, sample_colors
 from .render import render_depth
-from .segment import Segmentation, Segmented, segment, segment_depth
-from .solids import solid_mesh, solid_meshes
+from .segment import Segmentation, SegmentedCloud, segment, segment_depth
+from .solids import build_solid_mesh, build_solid_meshes
 from .stereo import StereoNoise
-from .view import Capture, View, capture, decode, encode
+from .view import Capture, View, capture, decode_depth, encode_depth
 
 __all__ = [
     "AbstractNoise",
@@ -23,24 +23,24 @@ __all__ = [
     "DepthNoise",
     "Lens",
     "Segmentation",
-    "Segmented",
+    "SegmentedCloud",
     "StereoNoise",
     "View",
     "align",
+    "build_solid_mesh",
+    "build_solid_meshes",
     "capture",
-    "colors_at",
-    "decode",
-    "encode",
+    "decode_depth",
+    "encode_depth",
     "erode",
     "look_at",
-    "lost_edges",
+    "mask_depth_edges",
+    "mask_steep_pixels",
     "render_depth",
     "reproject",
+    "sample_colors",
     "segment",
     "segment_depth",
-    "solid_mesh",
-    "solid_meshes",
-    "steep",
     "thin_to_count",
     "thin_to_spacing",
     "to_points",

@@ -1,4 +1,4 @@
-"""A depth camera: where a pixel looks, and where a point falls."""
+"""A depth camera: the ray of a pixel, and the pixel of a point."""
 
 from __future__ import annotations
 
@@ -15,31 +15,31 @@ Array = np.ndarray
 
 
 class Calibration(Protocol):
-    """What a recorded camera tells of itself, for example a ``recordings.Camera``."""
+    """The calibration of a recorded camera, for example a ``recordings.Camera``."""
 
     @property
     def width(self) -> int:
-        """Pixels."""
+        """Image width [px]."""
         ...
 
     @property
     def height(self) -> int:
-        """Pixels."""
+        """Image height [px]."""
         ...
 
     @property
     def K(self) -> Array:
-        """[3, 3] intrinsic matrix, pixels."""
+        """Intrinsic matrix [3, 3] px."""
         ...
 
     @property
     def T_world_camera(self) -> Array:
-        """[4, 4] camera to world, m."""
+        """Pose [4, 4] m, camera to world."""
         ...
 
     @property
     def distortion(self) -> Array:
-        """[N] coefficients in OpenCV's order."""
+        """Coefficients [N] in OpenCV's order."""
         ...
 
 
@@ -89,17 +89,17 @@ class DepthCamera:
             raise InvalidInput("range", got=self.range, expected="0 <= nearest < farthest, in m")
 
     @classmethod
-    def of(cls, recorded: Calibration, range: tuple[float, float] = (0.0, float("inf"))) -> DepthCamera:
-        """The camera of a recording: ``DepthCamera.of(recording.cameras["cam0"])``."""
+    def from_recording(cls, recorded: Calibration, range: tuple[float, float] = (0.0, float("inf"))) -> DepthCamera:
+        """Create the camera of a recording: ``DepthCamera.from_recording(recording.cameras["cam0"])``."""
         return cls(recorded.width, recorded.height, recorded.K, recorded.T_world_camera, range, recorded.distortion)
 
     @classmethod
     def azure_kinect_nfov(cls, T_world_camera: Array) -> DepthCamera:
-        """The Azure Kinect DK's depth camera in NFOV unbinned mode: its raw image, strongly distorted.
+        """Create the Azure Kinect DK's depth camera in NFOV unbinned mode: its raw image, strongly distorted.
 
         Size and range: Microsoft, "Azure Kinect DK hardware specifications" (640 x 576, 0.5 to 3.86 m). Lens: the
         factory calibration quoted in microsoft/Azure-Kinect-Sensor-SDK issue 1617, scaled to the 1024 px sensor and
-        cropped by (192, 180) px as mode_specific_calibration.c does, which also takes off half a pixel because the
+        cropped by (192, 180) px as mode_specific_calibration.c does. That also subtracts half a pixel, because the
         factory counts from the corner of a pixel and OpenCV from its centre. Each device has its own calibration; this
         is one example of them. The mode's hexagonal mask is left out.
 
@@ -115,12 +115,12 @@ class DepthCamera:
 
     @classmethod
     def realsense_d435(cls, T_world_camera: Array) -> DepthCamera:
-        """A RealSense D435's depth camera at 848 x 480, its best resolution; rectified by the camera, no distortion.
+        """Create a RealSense D435's depth camera at 848 x 480, its best resolution; the camera rectifies its images.
 
-        Focal length: as one device reports it (realsense-ros issue 2788: 424.23 px, 89.97 degrees across); the
-        principal point of that device, of which only the column is quoted, is put at its 423.4 and mid-height. Range:
-        about 0.2 m, where the search for 126 px of disparity ends (f b / 126 = 0.17 m), to 10 m
-        (Intel, "RealSense D400 series datasheet").
+        Focal length: as one device reports it (realsense-ros issue 2788: 424.23 px, 89.97 degrees across). Only the
+        column of that device's principal point is quoted (423.4 px); the row is put at mid-height. Range: about 0.2 m,
+        where the search for 126 px of disparity ends (f b / 126 = 0.17 m), to 10 m (Intel, "RealSense D400 series
+        datasheet").
 
         Args:
             T_world_camera: [4, 4] camera to world, m.
@@ -128,54 +128,57 @@ class DepthCamera:
         K = np.array([[424.229, 0.0, 423.426], [0.0, 424.229, 239.5], [0.0, 0.0, 1.0]])
         return cls(848, 480, K, T_world_camera, (0.2, 10.0))
 
-    def calibration(self) -> dict[str, Any]:
-        """What a recording keeps of it: ``recordings.Camera(**camera.calibration(), depth_scale=0.001)``."""
+    def to_calibration(self) -> dict[str, Any]:
+        """Return what a recording stores: ``recordings.Camera(**camera.to_calibration(), depth_scale=0.001)``."""
         return {name: getattr(self, name) for name in ("width", "height", "K", "T_world_camera", "distortion")}
 
-    def rectified(self) -> DepthCamera:
-        """The same camera with an ideal lens."""
+    def without_distortion(self) -> DepthCamera:
+        """Return the same camera with an ideal lens."""
         return replace(self, distortion=np.zeros(0))
 
     @cached_property
     def lens(self) -> Lens:
-        """Its distortion."""
+        """Distortion model of the lens."""
         return Lens(self.distortion)
 
     def project(self, points: Array) -> tuple[Array, Array]:
-        """Pixel coordinates [..., 2] (column, row) and depth [...] m of world points [..., 3] m; depth <= 0 is
-        behind the camera. Pixels are NaN where the lens model ends.
+        """Return pixel coordinates [..., 2] (column, row) and depths [...] m of world points [..., 3] m.
+
+        A depth <= 0 is behind the camera. Pixels are NaN beyond the end of the lens model.
         """
         local = (np.asarray(points, dtype=float) - self.T_world_camera[:3, 3]) @ self.T_world_camera[:3, :3]
         z = local[..., 2]
         with np.errstate(divide="ignore", invalid="ignore"):
-            if self.lens.plain:
+            if self.lens.is_identity:
                 image = local @ self.K.T
                 return image[..., :2] / image[..., 2:], z
-            fallen = self.lens.distort(local[..., :2] / z[..., None])
-        return fallen @ self.K[:2, :2].T + self.K[:2, 2], z
+            distorted = self.lens.distort(local[..., :2] / z[..., None])
+        return distorted @ self.K[:2, :2].T + self.K[:2, 2], z
 
     def unproject(self, pixels: Array, depth: Array) -> Array:
-        """World points [..., 3] m of pixel coordinates [..., 2] (column, row) at depths [...] m along the optical
-        axis; NaN where no ray falls by the lens model.
+        """Return world points [..., 3] m of pixel coordinates [..., 2] (column, row) at depths [...] m.
+
+        Depth is along the optical axis. Points are NaN where the lens model has no ray.
         """
         return self._place(self._rays(np.asarray(pixels, dtype=float)), np.asarray(depth, dtype=float))
 
     def rays(self) -> tuple[Array, Array]:
-        """Origin [3] m and directions [H, W, 3], world; a direction's length is such that its parameter is the depth
-        in m. NaN where no ray falls by the lens model.
+        """Return the origin [3] m and directions [H, W, 3] of all pixels, in the world.
+
+        A direction is scaled such that its parameter is the depth in m. It is NaN where the lens model has no ray.
         """
         origin = self.T_world_camera[:3, 3]
-        return origin, self._place(self.grid, np.ones((self.height, self.width))) - origin
+        return origin, self._place(self.pixel_rays, np.ones((self.height, self.width))) - origin
 
     @cached_property
-    def grid(self) -> Array:
-        """Rays [H, W, 2] (x / z, y / z) of the pixels in the camera's axes; NaN where there is none."""
+    def pixel_rays(self) -> Array:
+        """Rays [H, W, 2] (x / z, y / z) of the pixels in the camera's axes; NaN where the lens model has none."""
         columns, rows = np.meshgrid(np.arange(self.width), np.arange(self.height))
         return self._rays(np.stack([columns, rows], -1).astype(float))
 
-    def at_pixels(self, rows: Array, columns: Array, depth: Array) -> Array:
-        """World points [N, 3] m of whole pixels at depths [N] m; NaN where no ray falls by the lens model."""
-        return self._place(self.grid[rows, columns], np.asarray(depth, dtype=float))
+    def unproject_pixels(self, rows: Array, columns: Array, depth: Array) -> Array:
+        """Return world points [N, 3] m of integer pixels at depths [N] m; NaN where the lens model has no ray."""
+        return self._place(self.pixel_rays[rows, columns], np.asarray(depth, dtype=float))
 
     def _rays(self, pixels: Array) -> Array:
         y = (pixels[..., 1] - self.K[1, 2]) / self.K[1, 1]
@@ -188,8 +191,12 @@ class DepthCamera:
 
 
 def look_at(eye: Array, target: Array, up: Array = (0.0, 0.0, 1.0)) -> Array:  # type: ignore[assignment]
-    """Camera-to-world pose [4, 4] of a camera at ``eye`` [3] m that looks at ``target`` [3] m with ``up`` [3] upwards
-    in the image.
+    """Return the camera-to-world pose [4, 4] of a camera at ``eye`` [3] m that looks at ``target`` [3] m.
+
+    Args:
+        eye: [3] m, place of the camera.
+        target: [3] m, point in the centre of the image.
+        up: [3], direction that is upwards in the image.
 
     Raises:
         InvalidInput: the target is at the eye, straight along ``up``, or not finite.
@@ -197,8 +204,8 @@ def look_at(eye: Array, target: Array, up: Array = (0.0, 0.0, 1.0)) -> Array:  #
     eye, target, up = (np.asarray(a, dtype=float) for a in (eye, target, up))
     forward = target - eye
     right = np.cross(forward, up)
-    far = np.linalg.norm(forward)
-    if not (1e-9 <= far < np.inf and np.linalg.norm(right) >= 1e-9 * far):
+    distance = np.linalg.norm(forward)
+    if not (1e-9 <= distance < np.inf and np.linalg.norm(right) >= 1e-9 * distance):
         raise InvalidInput(
             "target",
             got=target.tolist(),

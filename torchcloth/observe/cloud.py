@@ -1,4 +1,4 @@
-"""From depth images and masks to points in the world, and down to as many points as a fit needs."""
+"""World points from depth images and masks, and the thinning of clouds."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ Array = np.ndarray
 
 
 def to_points(camera: DepthCamera, depth: Array, mask: Array | None = None) -> Array:
-    """World points [N, 3] m of the pixels that have a depth, a ray and lie in the mask, row by row.
+    """Compute world points [N, 3] m of the pixels that have a depth and a ray and lie in the mask, row by row.
 
     Args:
-        camera: the camera that took the image.
+        camera: that took the image.
         depth: [H, W] m, 0 = invalid.
-        mask: [H, W] bool, the pixels wanted; None wants all.
+        mask: [H, W] bool, pixels to use; None: all.
 
     Raises:
         InvalidInput: an image that has not the camera's size.
@@ -27,15 +27,15 @@ def to_points(camera: DepthCamera, depth: Array, mask: Array | None = None) -> A
         if image is not None and np.shape(image) != shape:
             raise InvalidInput(name, got=f"shape {np.shape(image)}", expected=f"{shape}, the camera's size")
     wanted = has_reading(depth) if mask is None else has_reading(depth) & np.asarray(mask, bool)
-    rows, columns = np.nonzero(wanted & np.isfinite(camera.grid[..., 0]))
-    return camera.at_pixels(rows, columns, depth[rows, columns])
+    rows, columns = np.nonzero(wanted & np.isfinite(camera.pixel_rays[..., 0]))
+    return camera.unproject_pixels(rows, columns, depth[rows, columns])
 
 
 def has_reading(depth: Array) -> Array:
-    """Pixels [H, W] whose depth says where something is: ROS writes NaN for none and infinity for too far (REP 118).
+    """Return which pixels [H, W] have a valid depth; ROS writes NaN for none and infinity for too far (REP 118).
 
     Raises:
-        InvalidInput: whole numbers, which are no metres.
+        InvalidInput: integers, which are not metres.
     """
     if depth.dtype.kind in "iu":
         remedy = "a camera's file is in other units: times metres per unit, 0.001 for millimetres"
@@ -44,8 +44,9 @@ def has_reading(depth: Array) -> Array:
 
 
 def erode(mask: Array, pixels: int = 1) -> Array:
-    """The mask [H, W] without its rim of ``pixels``, as a segmentation leaves out the unsure border; the image's
-    border is no rim.
+    """Return the mask [H, W] without a rim of ``pixels`` px, where a segmentation is uncertain.
+
+    The border of the image is no rim.
     """
     mask = np.asarray(mask, bool)
     for _ in range(pixels):
@@ -55,9 +56,9 @@ def erode(mask: Array, pixels: int = 1) -> Array:
 
 
 def thin_to_count(points: Array, count: int, rng: np.random.Generator) -> Array:
-    """At most ``count`` of the points [N, 3], drawn at random without repetition, in their old order.
+    """Draw at most ``count`` of the points [N, 3] at random without repetition, and keep their order.
 
-    They are measured points: nothing is averaged, the noise of each stays what it was.
+    These are measured points: nothing is averaged, so the noise of each point does not change.
     """
     if count < 1:
         raise InvalidInput("count", got=count, expected="at least 1 point")
@@ -67,20 +68,20 @@ def thin_to_count(points: Array, count: int, rng: np.random.Generator) -> Array:
 
 
 def thin_to_spacing(points: Array, spacing: float) -> Array:
-    """One measured point of each occupied cube of edge ``spacing`` m: the one nearest to the mean of the cube's points.
+    """Return one measured point of each occupied cube: the one nearest to the mean of the cube's points.
 
-    The mean itself would have less noise than the camera; a measured point has the camera's own (a little less, as
-    outliers are seldom nearest to the mean).
+    The mean itself would have less noise than the camera. A measured point has the camera's own noise (a little less,
+    as outliers are seldom nearest to the mean).
 
     Args:
-        points: [N, 3] m; those that are not finite are in no cube.
-        spacing: m.
+        points: [N, 3] m; points that are not finite are in no cube.
+        spacing: m, edge of the cubes.
     """
-    return np.asarray(points, dtype=float)[spaced(points, spacing)]
+    return np.asarray(points, dtype=float)[select_by_spacing(points, spacing)]
 
 
-def spaced(points: Array, spacing: float) -> Array:
-    """Indices, in order, of the points that `thin_to_spacing` keeps."""
+def select_by_spacing(points: Array, spacing: float) -> Array:
+    """Return the indices, in order, of the points that ``thin_to_spacing`` selects."""
     points = np.asarray(points, dtype=float)
     if not spacing > 0:
         raise InvalidInput("spacing", got=spacing, expected="a positive length in m")

@@ -1,4 +1,4 @@
-"""Lens distortion in OpenCV's order: where a ray falls, and the ray that falls there, or none."""
+"""Lens distortion in OpenCV's order, and its inverse."""
 
 from __future__ import annotations
 
@@ -10,11 +10,12 @@ from ..errors import InvalidInput
 
 Array = np.ndarray
 
-SIZES = (0, 4, 5, 8, 12, 14)
-WIDEST = 10.0  # ray radius up to which the model is followed, 84 degrees off axis
-SAMPLES = 4001  # radii at which the radial part is looked at
-ROUNDS = 30  # of Newton's iteration
-EXACT = 1e-10  # residual in normalised image coordinates: 1e-7 px or less for any common focal length
+COEFFICIENT_COUNTS = (0, 4, 5, 8, 12, 14)
+MAX_RAY_RADIUS = 10.0  # tan of the angle off axis up to which the model is evaluated, 84 degrees
+RADIAL_SAMPLES = 4001  # radii at which the radial part is sampled
+MAX_NEWTON_ITERATIONS = 30
+MAX_UNDISTORT_RESIDUAL = 1e-10  # in normalised image coordinates: 1e-7 px or less for any common focal length
+NEGLIGIBLE_RESIDUAL = 1e-15  # in normalised image coordinates, at which the iteration stops
 
 
 class Lens:
@@ -26,9 +27,9 @@ class Lens:
         y' = g y + p1 (r^2 + 2 y^2) + 2 p2 x y + s3 r^2 + s4 r^4
 
     followed by the homography of a sensor tilted by tx, ty (OpenCV documentation, "Camera Calibration and 3D
-    Reconstruction"). The radial part g r is followed up to its first turning point (or pole): beyond it two rays share
-    a pixel, and the calibration says nothing. Such rays and pixels are NaN. (Tangential
-    and thin-prism terms fold the image a little earlier, at 97 % of that: there a pixel may still be of another ray.)
+    Reconstruction"). The radial part g r is used up to its first turning point (or pole). Beyond it two rays share a
+    pixel, and the calibration is meaningless; such rays and pixels are NaN. Tangential and thin-prism terms fold the
+    image a little earlier, at 97 % of that radius: there a pixel may still belong to another ray.
 
     Args:
         coefficients: none, (k1, k2, p1, p2), and further k3, (k4, k5, k6), (s1, s2, s3, s4), (tx, ty) rad.
@@ -39,7 +40,7 @@ class Lens:
 
     def __init__(self, coefficients: Array) -> None:
         given = np.array(coefficients, dtype=float).ravel()
-        if given.size not in SIZES or not np.isfinite(given).all():
+        if given.size not in COEFFICIENT_COUNTS or not np.isfinite(given).all():
             raise InvalidInput(
                 "distortion",
                 got=given.tolist(),
@@ -53,76 +54,81 @@ class Lens:
         self._tilt = _tilt(*full[12:]) if full[12:].any() else None
 
     @property
-    def plain(self) -> bool:
-        """Whether it distorts nothing."""
+    def is_identity(self) -> bool:
+        """Whether the lens distorts nothing."""
         return not self.coefficients.any()
 
     @property
-    def limit(self) -> float:
-        """Largest radius of a ray that the model can tell from others."""
+    def max_radius(self) -> float:
+        """Largest radius of a ray, in normalised coordinates, for which the model is one-to-one."""
         return float(self._radial[0][-1])
 
     def distort(self, rays: Array) -> Array:
-        """Where rays [..., 2] fall, [..., 2]; NaN beyond `limit`."""
+        """Return the image coordinates [..., 2] of rays [..., 2]; NaN beyond ``max_radius``."""
         rays = np.asarray(rays, dtype=float)
-        if self.plain:
+        if self.is_identity:
             return rays
         with np.errstate(all="ignore"):
-            inside = (rays**2).sum(-1, keepdims=True) <= self.limit**2
+            inside = (rays**2).sum(-1, keepdims=True) <= self.max_radius**2
             return np.where(inside, self._warp(rays[..., 0], rays[..., 1])[0], np.nan)
 
     def undistort(self, image: Array) -> Array:
-        """The rays [..., 2] that fall at [..., 2], by Newton's iteration from the radial part's own inverse.
+        """Return the rays [..., 2] of image coordinates [..., 2].
 
-        NaN where the iteration does not end at a ray within `limit` that falls there to 1e-10.
+        Newton's iteration starts from the inverse of the radial part. A ray is NaN if the iteration does not end within
+        ``max_radius`` and a residual of 1e-10.
         """
         image = np.asarray(image, dtype=float)
-        if self.plain:
+        if self.is_identity:
             return image
-        target = image if self._tilt is None else _through(np.linalg.inv(self._tilt), image)
-        radii, fallen = self._radial
+        target = image if self._tilt is None else _apply_homography(np.linalg.inv(self._tilt), image)
+        radii, image_radii = self._radial
         with np.errstate(all="ignore"):
             distance = np.linalg.norm(target, axis=-1)
-            start = np.interp(distance, fallen, radii) / np.where(distance > 0, distance, 1.0)
+            start = np.interp(distance, image_radii, radii) / np.where(distance > 0, distance, 1.0)
             rays = target * np.where(distance > 0, start, 1.0)[..., None]
-            for _ in range(ROUNDS):
-                off, gradient = self._residual(rays, target)
-                if not np.nanmax(np.abs(off), initial=0.0) > 1e-15:
+            for _ in range(MAX_NEWTON_ITERATIONS):
+                residual, gradient = self._residual(rays, target)
+                if not np.nanmax(np.abs(residual), initial=0.0) > NEGLIGIBLE_RESIDUAL:
                     break
-                rays = rays - _solve(gradient, off)
-            off, gradient = self._residual(rays, target)
+                rays = rays - _solve_2x2(gradient, residual)
+            residual, gradient = self._residual(rays, target)
             (a, b), (c, d) = gradient
-            good = (np.abs(off).max(-1) < EXACT) & ((rays**2).sum(-1) <= self.limit**2) & (a * d > b * c)
+            good = (
+                (np.abs(residual).max(-1) < MAX_UNDISTORT_RESIDUAL)
+                & ((rays**2).sum(-1) <= self.max_radius**2)
+                & (a * d > b * c)
+            )
         return np.where(good[..., None], rays, np.nan)
 
     @cached_property
     def _radial(self) -> tuple[Array, Array]:
-        """Radii of rays, and where they fall, as long as that grows."""
-        radii = np.linspace(0, WIDEST, SAMPLES)
-        above, below = (1 + np.polynomial.polynomial.polyval(radii**2, [0, *k]) for k in self._k)
+        """Radii of rays and of their images, up to the first turning point."""
+        radii = np.linspace(0, MAX_RAY_RADIUS, RADIAL_SAMPLES)
+        numerator, denominator = (1 + np.polynomial.polynomial.polyval(radii**2, [0, *k]) for k in self._k)
         with np.errstate(all="ignore"):
-            fallen = radii * above / below
-        stop = np.flatnonzero((np.diff(fallen) <= 0) | (below[1:] <= 0) | ~np.isfinite(fallen[1:]))
-        end = int(stop[0]) + 1 if stop.size else SAMPLES
-        return radii[:end], fallen[:end]
+            image_radii = radii * numerator / denominator
+        stop = np.flatnonzero((np.diff(image_radii) <= 0) | (denominator[1:] <= 0) | ~np.isfinite(image_radii[1:]))
+        end = int(stop[0]) + 1 if stop.size else RADIAL_SAMPLES
+        return radii[:end], image_radii[:end]
 
     def _residual(self, rays: Array, target: Array) -> tuple[Array, tuple]:
-        place, gradient = self._lens(rays[..., 0], rays[..., 1])
-        return place - target, gradient
+        position, gradient = self._lens(rays[..., 0], rays[..., 1])
+        return position - target, gradient
 
     def _warp(self, x: Array, y: Array) -> tuple[Array, tuple]:
-        place, gradient = self._lens(x, y)
-        return (place if self._tilt is None else _through(self._tilt, place)), gradient
+        position, gradient = self._lens(x, y)
+        return (position if self._tilt is None else _apply_homography(self._tilt, position)), gradient
 
     def _lens(self, x: Array, y: Array) -> tuple[Array, tuple]:
-        """Place [..., 2] before the tilt, and its derivatives ((xx, xy), (yx, yy))."""
+        """Image position [..., 2] before the tilt, and its derivatives ((xx, xy), (yx, yy))."""
         (k1, k2, k3), (k4, k5, k6) = self._k
         (p1, p2), (s1, s2, s3, s4) = self._p, self._s
         q = x * x + y * y
-        above, below = 1 + q * (k1 + q * (k2 + q * k3)), 1 + q * (k4 + q * (k5 + q * k6))
-        g = above / below
-        slope = ((k1 + q * (2 * k2 + q * 3 * k3)) - g * (k4 + q * (2 * k5 + q * 3 * k6))) / below  # dg / dq
-        place = np.stack(
+        numerator, denominator = 1 + q * (k1 + q * (k2 + q * k3)), 1 + q * (k4 + q * (k5 + q * k6))
+        g = numerator / denominator
+        slope = ((k1 + q * (2 * k2 + q * 3 * k3)) - g * (k4 + q * (2 * k5 + q * 3 * k6))) / denominator  # dg / dq
+        position = np.stack(
             [
                 g * x + 2 * p1 * x * y + p2 * (q + 2 * x * x) + q * (s1 + q * s2),
                 g * y + p1 * (q + 2 * y * y) + 2 * p2 * x * y + q * (s3 + q * s4),
@@ -135,7 +141,7 @@ class Lens:
         xy = cross + 2 * p1 * x + 2 * p2 * y + thin_x * y
         yx = cross + 2 * p1 * x + 2 * p2 * y + thin_y * x
         yy = g + 2 * slope * y * y + 6 * p1 * y + 2 * p2 * x + thin_y * y
-        return place, ((xx, xy), (yx, yy))
+        return position, ((xx, xy), (yx, yy))
 
 
 def _tilt(tx: float, ty: float) -> Array:
@@ -146,14 +152,14 @@ def _tilt(tx: float, ty: float) -> Array:
     return np.array([[turn[2, 2], 0, -turn[0, 2]], [0, turn[2, 2], -turn[1, 2]], [0, 0, 1]]) @ turn
 
 
-def _through(homography: Array, image: Array) -> Array:
+def _apply_homography(homography: Array, image: Array) -> Array:
     full = np.concatenate([image, np.ones((*image.shape[:-1], 1))], -1) @ homography.T
     return full[..., :2] / full[..., 2:]
 
 
-def _solve(gradient: tuple, off: Array) -> Array:
+def _solve_2x2(gradient: tuple, residual: Array) -> Array:
     (a, b), (c, d) = gradient
     return (
-        np.stack([d * off[..., 0] - b * off[..., 1], a * off[..., 1] - c * off[..., 0]], -1)
+        np.stack([d * residual[..., 0] - b * residual[..., 1], a * residual[..., 1] - c * residual[..., 0]], -1)
         / (a * d - b * c)[..., None]
     )

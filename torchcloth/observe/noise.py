@@ -1,4 +1,4 @@
-"""What depth cameras do to a perfect depth image: the interface, and time of flight."""
+"""Errors of depth cameras: the interface, and a model of time-of-flight cameras."""
 
 from __future__ import annotations
 
@@ -12,30 +12,31 @@ from ..errors import InvalidInput
 from .cloud import has_reading
 
 Array = np.ndarray
+MAX_INTERPOLATED_STEP_M = 0.02  # larger steps between neighbouring pixels are silhouettes
 
 
 class AbstractNoise(ABC):
     """A sensor's errors: random ones in every image, and a bias that stays with the device.
 
     Attributes:
-        leading: axes of the bias before those of the image.
+        bias_leading_shape: axes of the bias before those of the image.
     """
 
-    leading: ClassVar[tuple[int, ...]] = ()
+    bias_leading_shape: ClassVar[tuple[int, ...]] = ()
 
     @abstractmethod
     def sigma(self, depth: Array) -> Array:
-        """Standard deviation [...] m of the random error at depths [...] m, away from edges."""
+        """Return the standard deviation [...] m of the random error at depths [...] m, away from edges."""
 
     @abstractmethod
     def apply(self, depth: Array, rng: np.random.Generator, bias: Array | None = None) -> Array:
-        """A noisy copy of a depth image.
+        """Return a noisy copy of a depth image.
 
         Args:
-            depth: [H, W] m, 0 where nothing is seen.
+            depth: [H, W] m, 0 = nothing is seen.
             rng: source of the random numbers; the same generator state gives the same image.
             bias: [..., H, W] what the device adds to every image of a sequence, drawn once by :meth:`bias_field`;
-                needed where :attr:`biased`.
+                needed if :attr:`has_bias`.
 
         Returns:
             [H, W] float32, m, 0 where nothing is seen or the pixel was lost.
@@ -43,26 +44,26 @@ class AbstractNoise(ABC):
 
     @abstractmethod
     def bias_field(self, shape: tuple[int, int], rng: np.random.Generator) -> Array:
-        """What a device adds to all its images, drawn once: [..., H, W], smooth, fixed to the image."""
+        """Draw what a device adds to all its images: [..., H, W], smooth, fixed to the image."""
 
     @property
     @abstractmethod
-    def biased(self) -> bool:
+    def has_bias(self) -> bool:
         """Whether an image needs a bias field."""
 
-    def checked(self, depth: Array, bias: Array | None) -> Array:
-        """The image as float32.
+    def validate_image(self, depth: Array, bias: Array | None) -> Array:
+        """Return the image as float32, with 0 for readings that are not finite.
 
         Raises:
-            InvalidInput: no image, whole numbers, which are no metres, or a bias that is missing or of another shape
-                than ``bias_field`` draws.
+            InvalidInput: no image, integers, which are not metres, or a bias that is missing or of another shape than
+                ``bias_field`` draws.
         """
         has_reading(np.asarray(depth))
         depth = np.asarray(depth, np.float32)
         if depth.ndim != 2:
             raise InvalidInput("depth", got=f"shape {depth.shape}", expected="[H, W]")
-        shape = (*self.leading, *depth.shape)
-        if (self.biased and bias is None) or (bias is not None and np.shape(bias) != shape):
+        shape = (*self.bias_leading_shape, *depth.shape)
+        if (self.has_bias and bias is None) or (bias is not None and np.shape(bias) != shape):
             raise InvalidInput(
                 "bias",
                 got=None if bias is None else f"shape {np.shape(bias)}",
@@ -74,26 +75,26 @@ class AbstractNoise(ABC):
 
 @dataclass(frozen=True)
 class DepthNoise(AbstractNoise):
-    """Random error, pixel jitter, lost edges, flying pixels and a slowly varying bias of a time-of-flight camera.
+    """Errors of a time-of-flight camera: random error, jitter, lost edges, flying pixels and a smooth bias.
 
-    The defaults are a working model of the Azure Kinect DK: sigma(z) = 0.5 mm + 1 mm/m * max(z - 0.5 m, 0), jitter
-    0.25 px and dropped edges as in BlenderProc's Azure Kinect post-processing, which cites Toelgyessy et al., Sensors
+    The defaults are a working model of the Azure Kinect DK: sigma(z) = 0.5 mm + 1 mm/m * max(z - 0.5 m, 0), jitter 0.25
+    px and dropped edges as in BlenderProc's Azure Kinect post-processing, which cites Toelgyessy et al., Sensors
     21(2):413 (2021). The maker's bounds are wider: standard deviation <= 17 mm, systematic error < 11 mm + 0.1 %
-    (Microsoft, "Azure Kinect DK hardware specifications"). Bias and flying pixels are off unless asked for.
+    (Microsoft, "Azure Kinect DK hardware specifications"). Bias and flying pixels are off by default.
 
     Attributes:
         sigma_base: m, standard deviation of a pixel's depth up to ``sigma_start``.
         sigma_slope: m/m, its growth with depth beyond.
         sigma_start: m.
         jitter: px, standard deviation of the place from which a pixel takes its depth, per axis.
-        edge_range: m, a pixel is lost where the depths of its 3 x 3 neighbourhood (missing neighbours aside) differ by
+        edge_range: m, a pixel is lost if the depths of its 3 x 3 neighbourhood (without missing neighbours) differ by
             more.
         bias_amplitude: m, standard deviation of the bias field.
         bias_relative: m/m, further standard deviation of the bias per metre of depth.
         bias_length: px, distance over which the bias field varies; the field is fixed to the image, as a calibration
             error is.
-        flying: share of the pixels at a step in depth of more than ``flying_step`` (and less than ``edge_range``) that
-            report a mixture of both sides.
+        flying_fraction: share of the pixels at a step in depth of more than ``flying_step`` (and less than
+            ``edge_range``) that report a mixture of both sides.
         flying_step: m.
     """
 
@@ -105,56 +106,56 @@ class DepthNoise(AbstractNoise):
     bias_amplitude: float = 0.0
     bias_relative: float = 0.0
     bias_length: float = 160.0
-    flying: float = 0.0
+    flying_fraction: float = 0.0
     flying_step: float = 0.02
 
     def __post_init__(self) -> None:
         check_fields(self)
         if self.bias_length < 1:
             raise InvalidInput("bias_length", got=self.bias_length, expected="at least 1 px")
-        if self.flying > 1:
-            raise InvalidInput("flying", got=self.flying, expected="a share, 0 to 1")
+        if self.flying_fraction > 1:
+            raise InvalidInput("flying_fraction", got=self.flying_fraction, expected="a share, 0 to 1")
 
     @classmethod
     def azure_kinect(cls) -> DepthNoise:
-        """With a bias that keeps within the maker's 11 mm + 0.1 % at two standard deviations, and flying pixels.
+        """Return the noise with flying pixels and a bias within the maker's 11 mm + 0.1 % at two standard deviations.
 
         That half of the pixels at an edge fly is our guess, not a measurement.
         """
-        return cls(bias_amplitude=5.5e-3, bias_relative=0.5e-3, flying=0.5)
+        return cls(bias_amplitude=5.5e-3, bias_relative=0.5e-3, flying_fraction=0.5)
 
     def without_bias(self) -> DepthNoise:
-        """The same with random errors only."""
+        """Return the same noise with random errors only."""
         return replace(self, bias_amplitude=0.0, bias_relative=0.0)
 
     @property
-    def biased(self) -> bool:
+    def has_bias(self) -> bool:
         """Whether an image needs a bias field."""
         return bool(self.bias_amplitude or self.bias_relative)
 
     def sigma(self, depth: Array) -> Array:
-        """Standard deviation [...] m of the random error at depths [...] m."""
+        """Return the standard deviation [...] m of the random error at depths [...] m."""
         return self.sigma_base + self.sigma_slope * np.maximum(np.asarray(depth) - self.sigma_start, 0.0)
 
     def apply(self, depth: Array, rng: np.random.Generator, bias: Array | None = None) -> Array:
-        """A noisy copy [H, W] float32 m of a depth image [H, W] m, see :meth:`AbstractNoise.apply`."""
-        depth = self.checked(depth, bias)
-        out = _jittered(depth, self.jitter, rng) if self.jitter else depth.copy()
-        seen = (out > 0) & (depth > 0)
-        if self.flying:
-            out = _flown(out, depth, self.flying, self.flying_step, rng)
+        """Return a noisy copy [H, W] float32 m of a depth image [H, W] m, see :meth:`AbstractNoise.apply`."""
+        depth = self.validate_image(depth, bias)
+        out = _jitter(depth, self.jitter, rng) if self.jitter else depth.copy()
+        is_seen = (out > 0) & (depth > 0)
+        if self.flying_fraction:
+            out = _add_flying_pixels(out, depth, self.flying_fraction, self.flying_step, rng)
         noisy = out + (self.sigma(out) * rng.standard_normal(out.shape)).astype(np.float32)
         if bias is not None:
             noisy += ((self.bias_amplitude + self.bias_relative * out) * bias).astype(np.float32)
-        return np.where(seen & ~lost_edges(depth, self.edge_range) & (noisy > 0), noisy, 0).astype(np.float32)
+        return np.where(is_seen & ~mask_depth_edges(depth, self.edge_range) & (noisy > 0), noisy, 0).astype(np.float32)
 
     def bias_field(self, shape: tuple[int, int], rng: np.random.Generator) -> Array:
-        """A smooth random field [H, W] of unit variance: bilinear between random values ``bias_length`` px apart."""
-        return smooth_field(shape, self.bias_length, rng)
+        """Draw a smooth random field [H, W] of unit variance, bilinear over ``bias_length`` px."""
+        return draw_smooth_field(shape, self.bias_length, rng)
 
 
-def smooth_field(shape: tuple[int, int], length: float, rng: np.random.Generator) -> Array:
-    """A random field [H, W], bilinear between normal values ``length`` px apart, of unit variance everywhere."""
+def draw_smooth_field(shape: tuple[int, int], length: float, rng: np.random.Generator) -> Array:
+    """Draw a random field [H, W] of unit variance, bilinear between normal values ``length`` px apart."""
     rows, cols = (int(np.ceil(n / length)) + 1 for n in shape)
     knots = rng.standard_normal((rows, cols))
     r, c = np.arange(shape[0]) / length, np.arange(shape[1]) / length
@@ -166,23 +167,28 @@ def smooth_field(shape: tuple[int, int], length: float, rng: np.random.Generator
 
 
 def check_fields(noise: AbstractNoise) -> None:
-    """Refuse parameters of a dataclass that are negative or not finite."""
+    """Refuse parameters of a dataclass that are negative or not finite.
+
+    Raises:
+        InvalidInput: names the first wrong one.
+    """
     for item in fields(noise):  # type: ignore[arg-type]
         value = getattr(noise, item.name)
         if not np.isfinite(value) or value < 0:
             raise InvalidInput(item.name, got=value, expected="a finite number that is not negative")
 
 
-def lost_edges(depth: Array, edge_range: float) -> Array:
-    """Mask [H, W] of pixels whose 3 x 3 neighbourhood spans more than ``edge_range`` m; pixels without depth do not
-    count.
+def mask_depth_edges(depth: Array, edge_range: float) -> Array:
+    """Return the mask [H, W] of pixels whose 3 x 3 neighbourhood spans more than ``edge_range`` m.
+
+    Pixels without depth do not count.
     """
-    near, far = neighbourhood(depth)
+    near, far = depth_range(depth)
     return far - near > edge_range
 
 
-def neighbourhood(depth: Array, reach: int = 1) -> tuple[Array, Array]:
-    """Nearest and farthest depth [H, W] within ``reach`` px of each pixel, inf and -inf where there is none."""
+def depth_range(depth: Array, reach: int = 1) -> tuple[Array, Array]:
+    """Return the nearest and farthest depth [H, W] within ``reach`` px of each pixel; inf and -inf without one."""
     known = has_reading(depth)
     near, far = np.where(known, depth, np.inf), np.where(known, depth, -np.inf)
     for _ in range(reach):
@@ -196,9 +202,9 @@ def _window(image: Array, pick: np.ufunc) -> Array:
     return pick(pick(rows[:, :-2], rows[:, 1:-1]), rows[:, 2:])
 
 
-def _flown(out: Array, depth: Array, share: float, step: float, rng: np.random.Generator) -> Array:
+def _add_flying_pixels(out: Array, depth: Array, share: float, step: float, rng: np.random.Generator) -> Array:
     """Pixels at a step in depth report a mixture of the near and the far side."""
-    near, far = neighbourhood(depth)
+    near, far = depth_range(depth)
     flies = (far - near > step) & (rng.random(depth.shape) < share)
     mixture = rng.random(depth.shape)[flies]
     out = out.copy()
@@ -206,10 +212,8 @@ def _flown(out: Array, depth: Array, share: float, step: float, rng: np.random.G
     return out
 
 
-def _jittered(depth: Array, jitter: float, rng: np.random.Generator) -> Array:
-    """Each pixel takes the depth found a little beside it: bilinear inside a surface, nearest where a neighbour is
-    missing or far.
-    """
+def _jitter(depth: Array, jitter: float, rng: np.random.Generator) -> Array:
+    """Each pixel takes the depth of a place near it: bilinear inside a surface, nearest at a silhouette."""
     height, width = depth.shape
     shift = jitter * rng.standard_normal((2, height, width))
     r = np.clip(np.arange(height)[:, None] + shift[0], 0, height - 1)
@@ -221,6 +225,6 @@ def _jittered(depth: Array, jitter: float, rng: np.random.Generator) -> Array:
     weights = np.stack([(1 - a) * (1 - b), (1 - a) * b, a * (1 - b), a * b])
     smooth = (corners * weights).sum(0)
     nearest = depth[np.rint(r).astype(int), np.rint(c).astype(int)]
-    # a mean across a silhouette would invent points in the air between two surfaces
-    broken = (corners.min(0) <= 0) | (corners.max(0) - corners.min(0) > 0.02)
+    # A mean across a silhouette would invent points in the air between two surfaces.
+    broken = (corners.min(0) <= 0) | (corners.max(0) - corners.min(0) > MAX_INTERPOLATED_STEP_M)
     return np.where(broken, nearest, smooth).astype(np.float32)

@@ -15,10 +15,10 @@ Array = np.ndarray
 
 
 def render_depth(camera: DepthCamera, meshes: Sequence[tuple[Array, Array]]) -> tuple[Array, Array]:
-    """What the camera would see without noise.
+    """Render what the camera would see without noise.
 
-    Both sides of every triangle are seen, so that a sheet needs no thickness. What lies nearer than the camera's range
-    still hides what is behind it.
+    Both sides of every triangle are visible, so that a sheet needs no thickness. Bodies nearer than the camera's range
+    still hide what is behind them.
 
     Args:
         camera: the camera.
@@ -26,17 +26,17 @@ def render_depth(camera: DepthCamera, meshes: Sequence[tuple[Array, Array]]) -> 
 
     Returns:
         Depth [H, W] float32, m along the optical axis, 0 where nothing is seen, and ids [H, W] int32: the index in
-        ``meshes`` of the body that was hit, -1 where none was (or it was out of range).
+        ``meshes`` of the body that was hit, -1 where there is none or it is out of range.
 
     Raises:
         MissingDependency: open3d cannot be imported.
         InvalidInput: a mesh that has the wrong shape, an index out of bounds or a vertex that is not finite.
     """
-    o3d = open3d_or_refuse()
+    o3d = import_open3d()
     scene = o3d.t.geometry.RaycastingScene()
     body = []
     for index, (vertices, faces) in enumerate(meshes):
-        vertices, faces = _checked(index, vertices, faces)
+        vertices, faces = _validate_mesh(index, vertices, faces)
         if len(faces) == 0:
             continue
         scene.add_triangles(o3d.core.Tensor(vertices), o3d.core.Tensor(faces))
@@ -44,17 +44,17 @@ def render_depth(camera: DepthCamera, meshes: Sequence[tuple[Array, Array]]) -> 
     origin, directions = camera.rays()
     if not body:
         return np.zeros(directions.shape[:2], np.float32), np.full(directions.shape[:2], -1, np.int32)
-    looking = np.isfinite(directions[..., :1])
-    rays = np.concatenate([np.broadcast_to(origin, directions.shape), np.where(looking, directions, 1.0)], -1)
+    has_ray = np.isfinite(directions[..., :1])
+    rays = np.concatenate([np.broadcast_to(origin, directions.shape), np.where(has_ray, directions, 1.0)], -1)
     hit = scene.cast_rays(o3d.core.Tensor(np.ascontiguousarray(rays, np.float32)))
     depth, geometry = hit["t_hit"].numpy(), hit["geometry_ids"].numpy()
-    seen = np.isfinite(depth) & (depth >= camera.range[0]) & (depth <= camera.range[1]) & looking[..., 0]
+    seen = np.isfinite(depth) & (depth >= camera.range[0]) & (depth <= camera.range[1]) & has_ray[..., 0]
     ids = np.full(depth.shape, -1, np.int32)
     ids[seen] = np.array(body, np.int32)[geometry[seen]]
     return np.where(seen, depth, 0).astype(np.float32), ids
 
 
-def _checked(index: int, vertices: Array, faces: Array) -> tuple[Array, Array]:
+def _validate_mesh(index: int, vertices: Array, faces: Array) -> tuple[Array, Array]:
     vertices, faces = np.ascontiguousarray(vertices, np.float32), np.ascontiguousarray(faces, np.uint32)
     if vertices.ndim != 2 or vertices.shape[1] != 3 or faces.ndim != 2 or faces.shape[1] != 3:
         raise InvalidInput(
@@ -67,8 +67,12 @@ def _checked(index: int, vertices: Array, faces: Array) -> tuple[Array, Array]:
     return vertices, faces
 
 
-def open3d_or_refuse() -> Any:
-    """The module open3d, or how to install it."""
+def import_open3d() -> Any:
+    """Import open3d, or say how to install it.
+
+    Raises:
+        MissingDependency: open3d cannot be imported.
+    """
     try:
         return import_module("open3d")  # here, not above: it takes seconds and needs a system library
     except ImportError as error:

@@ -1,4 +1,4 @@
-"""Rigid registration of a mesh to a point cloud from many starts, by iterated closest points."""
+"""Rigid registration of a mesh to a point cloud from scoring_sample starts, by iterated closest points (ICP)."""
 
 from __future__ import annotations
 
@@ -8,44 +8,59 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-TURNS = 8  # starts about the cloud's normal, for either side up
-ROUNDS = 40
-SAMPLES, JUDGES = 400, 1500  # points that take part, and that the poses found are compared by
-NEAR = 0.03  # m; pairs much farther apart hardly count
-TIE = 1.08  # poses whose misfits are within this factor cannot be told apart by them
-TRIES, SAME = 4, 0.35  # poses that are handed on; rad, nearer than this they are one
-SIDE = 0.3  # rad; of two like poses the one that keeps the upper side up may turn this much more
+START_TURNS = 8  # start rotations about the cloud's normal, for either side up
+ICP_ITERATIONS = 40
+ICP_POINTS = 400
+SCORING_POINTS = 1500  # points by which the resulting poses are compared
+PAIR_DISTANCE_SCALE_M = 0.03  # pairs that are much farther apart hardly count
+MISFIT_TIE_RATIO = 1.08  # poses with misfits within this factor fit equally well
+MAX_CANDIDATE_POSES = 4
+MIN_POSE_SEPARATION_RAD = 0.35  # poses that are nearer to each other are one
+UPPER_SIDE_BONUS_RAD = 0.3  # of two equally good poses, the one that keeps the upper side up may turn this much more
+TIE_RANK_OFFSET = -10.0  # ranks tied poses before all others
 
 
 class Pose(NamedTuple):
-    """x -> R x + t."""
+    """A rigid motion x -> R x + t.
 
-    R: Tensor  # [..., 3, 3]
-    t: Tensor  # [..., 3] m
+    Attributes:
+        R: [..., 3, 3].
+        t: [..., 3] m.
+    """
 
-    def of(self, x: Tensor) -> Tensor:
-        """[..., N, 3] m."""
+    R: Tensor
+    t: Tensor
+
+    def transform(self, x: Tensor) -> Tensor:
+        """Transform points [..., N, 3] m."""
         return x @ self.R.mT + self.t.unsqueeze(-2)
 
 
-def register(x: Tensor, faces: Tensor, points: Tensor) -> list[Pose]:
-    """Rigid motions that lay a mesh of vertices [V, 3] m on points [N, 3] m of one side of it, the likeliest first.
+def register_rigidly(x: Tensor, faces: Tensor, points: Tensor) -> list[Pose]:
+    """Compute rigid motions that lay a mesh on points of one side of it, the most likely first.
 
-    Both ways count, point to nearest vertex and vertex to nearest point: points alone would also fit into the middle of
-    a cloth larger than they are. Garments look alike from the front and from behind; of poses that fit alike, the one
-    that turns the vertices least comes first.
+    Distances count both ways, from points to their nearest vertices and from vertices to their nearest points: points
+    alone would also fit into the middle of a larger cloth. Garments look the same from the front and from behind. Of
+    poses that fit equally well, the one that turns the vertices least comes first.
+
+    Args:
+        x: [V, 3] m, vertices of the mesh.
+        faces: [F, 3], its triangles.
+        points: [N, 3] m.
     """
-    some, few = _some(x, SAMPLES), _some(points, SAMPLES)
-    pose = _starts(some, few)
-    for _ in range(ROUNDS):
-        placed = pose.of(some)
-        (to_point, point), (to_vertex, vertex) = _nearest(placed, few)
-        source = torch.cat([some.expand_as(placed), some[vertex]], dim=-2)
-        target = torch.cat([few[point], few.expand(len(placed), -1, -1)], dim=-2)
-        share = [d.new_full(d.shape, 1 / d.shape[-1]) / (1 + (d / NEAR) ** 2) for d in (to_point, to_vertex)]
-        pose = _kabsch(source, target, torch.cat(share, dim=-1))
-    surface, many = torch.cat([x, x[faces].mean(1)]), _some(points, JUDGES)
-    score = torch.stack([_misfit(one.of(surface), many) for one in map(Pose, *pose)])
+    mesh_sample, point_sample = _sample(x, ICP_POINTS), _sample(points, ICP_POINTS)
+    pose = _starts(mesh_sample, point_sample)
+    for _ in range(ICP_ITERATIONS):
+        placed = pose.transform(mesh_sample)
+        (to_point, point), (to_vertex, vertex) = _nearest(placed, point_sample)
+        source = torch.cat([mesh_sample.expand_as(placed), mesh_sample[vertex]], dim=-2)
+        target = torch.cat([point_sample[point], point_sample.expand(len(placed), -1, -1)], dim=-2)
+        weights = [
+            d.new_full(d.shape, 1 / d.shape[-1]) / (1 + (d / PAIR_DISTANCE_SCALE_M) ** 2) for d in (to_point, to_vertex)
+        ]
+        pose = _kabsch(source, target, torch.cat(weights, dim=-1))
+    surface, scoring_sample = torch.cat([x, x[faces].mean(1)]), _sample(points, SCORING_POINTS)
+    score = torch.stack([_misfit(one.transform(surface), scoring_sample) for one in map(Pose, *pose)])
     return _shortlist(pose, score, _axes(x)[:, 2])
 
 
@@ -56,34 +71,38 @@ def _nearest(placed: Tensor, points: Tensor):
 
 
 def _misfit(placed: Tensor, points: Tensor) -> Tensor:
-    """[] m, both ways; what lies far apart counts as far, not how far."""
+    """Misfit [] m, both ways; distances beyond twice the scale count as that."""
     (to_point, _), (to_surface, _) = _nearest(placed, points)
-    return torch.stack([d.clamp(max=2 * NEAR).square().mean().sqrt() for d in (to_point, to_surface)]).sum()
+    return torch.stack(
+        [d.clamp(max=2 * PAIR_DISTANCE_SCALE_M).square().mean().sqrt() for d in (to_point, to_surface)]
+    ).sum()
 
 
 def _shortlist(pose: Pose, score: Tensor, normal: Tensor) -> list[Pose]:
-    """Different poses, first those that fit about as well as the best, the least turned one leading; then by fit."""
-    turn = _angle(pose.R) - SIDE * (pose.R @ normal) @ normal
-    close = score <= TIE * score.min()
-    order = torch.where(close, turn - 10.0, score / score.min()).argsort().tolist()
-    kept: list[int] = []
+    """Different poses: first those that fit about as well as the best, the least turned one leading; then by misfit."""
+    turn = _angle(pose.R) - UPPER_SIDE_BONUS_RAD * (pose.R @ normal) @ normal
+    close = score <= MISFIT_TIE_RATIO * score.min()
+    order = torch.where(close, turn + TIE_RANK_OFFSET, score / score.min()).argsort().tolist()
+    chosen: list[int] = []
     for k in order:
-        if len(kept) < TRIES and all(_angle(pose.R[k] @ pose.R[other].mT) > SAME for other in kept):
-            kept.append(k)
-    return [Pose(pose.R[k], pose.t[k]) for k in kept]
+        if len(chosen) < MAX_CANDIDATE_POSES and all(
+            _angle(pose.R[k] @ pose.R[other].mT) > MIN_POSE_SEPARATION_RAD for other in chosen
+        ):
+            chosen.append(k)
+    return [Pose(pose.R[k], pose.t[k]) for k in chosen]
 
 
 def _angle(R: Tensor) -> Tensor:
-    """[...] rad of rotations [..., 3, 3]."""
+    """Rotation angles [...] rad of rotations [..., 3, 3]."""
     return ((R.diagonal(dim1=-2, dim2=-1).sum(-1) - 1) / 2).clamp(-1, 1).acos()
 
 
 def _starts(x: Tensor, points: Tensor) -> Pose:
-    """Principal axes on principal axes, turned about the last; and the vertices as they lie, only moved."""
+    """Start poses: principal axes aligned and turned about the last; and the vertices as they lie, only moved."""
     mine, theirs = _axes(x), _axes(points)
     rotations = [torch.eye(3, dtype=x.dtype)]
-    for k in range(TURNS):
-        c, s = math.cos(2 * math.pi * k / TURNS), math.sin(2 * math.pi * k / TURNS)
+    for k in range(START_TURNS):
+        c, s = math.cos(2 * math.pi * k / START_TURNS), math.sin(2 * math.pi * k / START_TURNS)
         turn = x.new_tensor([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
         flip = torch.diag(x.new_tensor([1.0, -1.0, -1.0]))
         rotations += [theirs @ turn @ mine.mT, theirs @ turn @ flip @ mine.mT]
@@ -108,7 +127,7 @@ def _kabsch(source: Tensor, target: Tensor, weight: Tensor) -> Pose:
     return Pose(R, (b - a @ R.mT).squeeze(-2))
 
 
-def _some(x: Tensor, count: int) -> Tensor:
-    """At most ``count`` of the rows, drawn in the same way every time."""
+def _sample(x: Tensor, count: int) -> Tensor:
+    """At most ``count`` of the rows, drawn the same way every time."""
     order = torch.randperm(len(x), generator=torch.Generator().manual_seed(0))
     return x[order[:count]]

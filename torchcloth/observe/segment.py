@@ -1,4 +1,4 @@
-"""From everything that a depth camera saw to the points of the cloth."""
+"""Segmentation: from everything that a depth camera saw to the points of the cloth."""
 
 from __future__ import annotations
 
@@ -10,90 +10,104 @@ import numpy as np
 
 from ..errors import InvalidInput
 from .camera import DepthCamera
-from .cloud import has_reading, spaced, to_points
-from .register import check_bytes, steep
-from .render import open3d_or_refuse
+from .cloud import has_reading, select_by_spacing, to_points
+from .register import check_uint8, mask_steep_pixels
+from .render import import_open3d
 
 Array = np.ndarray
 Mesh = tuple[Array, Array]
-LEVEL = np.cos(np.deg2rad(10.0))  # a table is level to 10 degrees
-TRIES, ROUNDS, REFITS = 4, 300, 20  # planes looked at, draws for each, and least squares after them
-UNDER = 0.01  # share of the points that may lie under a table
-NOISE = 2.5  # times ``flat``, that a table may scatter by
-FLANK = 8  # times ``flat`` around a plane, where one looks whether it is the flank of another
+MIN_TABLE_LEVEL_COSINE = np.cos(np.deg2rad(10.0))  # a table is level to 10 degrees
+MAX_TABLE_CANDIDATES = 4  # planes that are tried
+RANSAC_DRAWS = 300  # of three points, for each plane
+PLANE_REFITS = 20  # smallest-squares fits after the draws
+MIN_PLANE_POINTS = 100
+MIN_PLANE_FRACTION = 0.02  # of the points; a plane of fewer is no table
+MAX_FRACTION_UNDER_TABLE = 0.01  # of the points
+MAX_TABLE_SCATTER_RATIO = 2.5  # standard deviation of a table's points over ``plane_tolerance``
+FLANK_BINS = 8  # bins of ``plane_tolerance`` on either side of a plane that show whether it is the flank of another
+MAX_NORMAL_NEIGHBOURS = 30
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Segmentation:
-    """How cloth points are told from the rest. A stage whose number is None (a length of 0) is left out.
+    """Stages that tell cloth points from the rest. A stage whose number is None, or a length of 0, is skipped.
 
-    The stages run in the order of the attributes. Lengths are in m, in the world.
+    The stages run in the order of the attributes. Lengths are in m, in the world frame.
 
     Attributes:
-        edge: pixels whose 3 x 3 neighbourhood spans more than this are dropped (flying pixels); depth images only.
-        low, high: [3] corners of the workspace; -inf and inf where a side is open.
-        hsv: two corners (hue, saturation, value), each 0 to 1, of the cloth's colours; a hue range may pass through 1,
-            as (0.95, ...), (0.05, ...) does for red.
-        robot: points nearer than this to the robot's solids are the robot; more where the sensor's bias is larger.
+        max_depth_step: pixels whose 3 x 3 neighbourhood spans more than this are dropped (flying pixels); depth images
+            only.
+        workspace_low: [3], lower corner of the workspace; -inf where a side is open.
+        workspace_high: [3], upper corner of the workspace; inf where a side is open.
+        hsv_range: two corners (hue, saturation, value), each 0 to 1, of the cloth's colours. A hue range may pass
+            through 1, as (0.95, ...), (0.05, ...) does for red.
+        robot_margin: points nearer than this to the robot's solids are the robot; use more for a sensor with a larger
+            bias.
         table: "find", or [4] (a, b, c, d) of the plane a x + b y + c z + d = 0 with unit normal (a, b, c) upwards.
-        above: the table is all that lies lower than this over its plane. Give three standard deviations of the sensor
-            or more: at 1 m 6 mm suits an Azure Kinect, 15 mm a D435. Cloth lying flatter goes with the table: tell it
-            apart by colour instead, and set ``above`` to -0.01.
-        flat: distance within which points count as the table's while it is searched for: at least the sensor's standard
-            deviation there (8 mm of a D435 at 1.5 m), or the table may be found millimetres off, or not at all.
-        neighbours, deviations: a point is an outlier where the mean distance to so many neighbours exceeds the cloud's
-            mean by so many standard deviations.
-        radius, company: and where fewer than ``company`` others lie within ``radius``.
-        gap: clusters are apart where they are farther from each other than this (DBSCAN).
-        crowd: a point with so many within ``gap`` is inside a cluster.
-        reach: clusters within this of a grasp are cloth; the largest, where no grasp is given.
+        table_margin: points lower than this above the table's plane are the table. Use three standard deviations of the
+            sensor or more: at 1 m, 6 mm suits an Azure Kinect and 15 mm a D435. Cloth that lies flatter is removed with
+            the table; then tell it apart by colour and set ``table_margin`` to -0.01.
+        plane_tolerance: points within this distance count as the table's while it is searched for. Use at smallest the
+            sensor's standard deviation there (8 mm of a D435 at 1.5 m), or the table may be found millimetres off, or
+            not at all.
+        outlier_neighbours: number of nearest neighbours whose mean distance decides whether a point is an outlier.
+        outlier_deviations: a point is an outlier if that distance exceeds the cloud's mean by so many standard
+            deviations.
+        isolation_radius: radius in which a point must have neighbours.
+        isolation_neighbours: number of neighbours that it must have.
+        cluster_gap: clusters are farther from each other than this (DBSCAN).
+        cluster_core_points: a point with so many neighbours within ``cluster_gap`` is inside a cluster.
+        grasp_distance: clusters within this of a grasp are cloth; without grasps, the largest cluster is.
         spacing: one measured point is kept of each cube with this edge.
-        normals: radius of the neighbourhood that gives the normals.
+        normal_radius: radius of the neighbourhood from which normals are estimated.
     """
 
-    edge: float | None = 0.03
-    low: tuple[float, float, float] | None = None
-    high: tuple[float, float, float] | None = None
-    hsv: tuple[tuple[float, float, float], tuple[float, float, float]] | None = None
-    robot: float | None = 0.012
+    max_depth_step: float | None = 0.03
+    workspace_low: tuple[float, float, float] | None = None
+    workspace_high: tuple[float, float, float] | None = None
+    hsv_range: tuple[tuple[float, float, float], tuple[float, float, float]] | None = None
+    robot_margin: float | None = 0.012
     table: str | tuple[float, float, float, float] | None = None
-    above: float = 0.006
-    flat: float = 0.004
-    neighbours: int | None = 20
-    deviations: float = 3.0
-    radius: float | None = None
-    company: int = 5
-    gap: float | None = 0.02
-    crowd: int = 8
-    reach: float = 0.05
+    table_margin: float = 0.006
+    plane_tolerance: float = 0.004
+    outlier_neighbours: int | None = 20
+    outlier_deviations: float = 3.0
+    isolation_radius: float | None = None
+    isolation_neighbours: int = 5
+    cluster_gap: float | None = 0.02
+    cluster_core_points: int = 8
+    grasp_distance: float = 0.05
     spacing: float | None = None
-    normals: float | None = None
+    normal_radius: float | None = None
 
     def __post_init__(self) -> None:
-        for name in ("edge", "robot", "flat", "radius", "gap", "reach", "spacing", "normals"):
-            value, free = getattr(self, name), name not in ("flat", "reach")  # of a stage that is left out by itself
-            if value is None and free:
+        optional = ("max_depth_step", "robot_margin", "isolation_radius", "cluster_gap", "spacing", "normal_radius")
+        for name in (*optional, "plane_tolerance", "grasp_distance"):
+            value, is_optional = getattr(self, name), name in optional
+            if value is None and is_optional:
                 continue
             if value is None or not 0 <= value < np.inf:
-                raise InvalidInput(name, got=value, expected="None or " * free + "a finite number that is not negative")
-        if not 0 < self.deviations < np.inf:  # of 0, half of every cloud would be outliers
-            raise InvalidInput("deviations", got=self.deviations, expected="a finite number > 0")
-        for name in ("neighbours", "company", "crowd"):
-            value, free = getattr(self, name), name == "neighbours"
-            if value is None and free:
+                expected = "None or " * is_optional + "a finite number that is not negative"
+                raise InvalidInput(name, got=value, expected=expected)
+        if not 0 < self.outlier_deviations < np.inf:  # with 0, half of every cloud would be outliers
+            raise InvalidInput("outlier_deviations", got=self.outlier_deviations, expected="a finite number > 0")
+        for name in ("outlier_neighbours", "isolation_neighbours", "cluster_core_points"):
+            value, is_optional = getattr(self, name), name == "outlier_neighbours"
+            if value is None and is_optional:
                 continue
             if value is None or not (value >= 1 and value == int(value)):
-                raise InvalidInput(name, got=value, expected="None or " * free + "a whole number >= 1")
-        if not np.isfinite(self.above):
-            raise InvalidInput("above", got=self.above, expected="a finite height in m")
-        for name, shape in (("low", (3,)), ("high", (3,)), ("hsv", (2, 3))):
+                raise InvalidInput(name, got=value, expected="None or " * is_optional + "a whole number >= 1")
+        if not np.isfinite(self.table_margin):
+            raise InvalidInput("table_margin", got=self.table_margin, expected="a finite height in m")
+        for name, shape in (("workspace_low", (3,)), ("workspace_high", (3,)), ("hsv_range", (2, 3))):
             value = getattr(self, name)
             if value is not None and (np.shape(value) != shape or np.isnan(np.asarray(value, float)).any()):
                 raise InvalidInput(name, got=value, expected=f"numbers of shape {list(shape)}")
-        if self.low is not None and self.high is not None and not bool(np.all(np.less(self.low, self.high))):
-            raise InvalidInput("low", got=self.low, expected=f"below high, {self.high}")
-        if self.hsv is not None and not (np.min(self.hsv) >= 0 and np.max(self.hsv) <= 1):
-            raise InvalidInput("hsv", got=self.hsv, expected="hue, saturation and value from 0 to 1")
+        low, high = self.workspace_low, self.workspace_high
+        if low is not None and high is not None and not bool(np.all(np.less(low, high))):
+            raise InvalidInput("workspace_low", got=low, expected=f"below workspace_high, {high}")
+        if self.hsv_range is not None and not (np.min(self.hsv_range) >= 0 and np.max(self.hsv_range) <= 1):
+            raise InvalidInput("hsv_range", got=self.hsv_range, expected="hue, saturation and value from 0 to 1")
         if isinstance(self.table, str) and self.table != "find":
             raise InvalidInput("table", got=repr(self.table), expected='"find", a plane (a, b, c, d), or None')
         if self.table is not None and not isinstance(self.table, str):
@@ -109,23 +123,23 @@ class Segmentation:
 
 
 @dataclass(frozen=True, eq=False)
-class Segmented:
-    """What is left.
+class SegmentedCloud:
+    """The result of a segmentation.
 
     Attributes:
-        points: [N, 3] m.
-        kept: [N] which of the points that came in.
-        removed: how many each stage took away, in order; stages that were left out are absent. A table that was looked
-            for and not found took 0, and ``table`` is None: its points are still there.
-        came: how many came in.
+        points: [N, 3] m, points of the cloth.
+        indices: [N], which of the input points these are.
+        removed: number of points that each stage removed, in order; skipped stages are absent. If a table was searched
+            for and not found, its number is 0 and ``table`` is None: its points are still among the others.
+        input_count: number of input points.
         table: [4] (a, b, c, d) of the plane that was removed, or None.
-        normals: [N, 3] unit, towards the camera where it is known, or None.
+        normals: [N, 3] unit, towards the camera if its place is known, or None.
     """
 
     points: Array
-    kept: Array
+    indices: Array
     removed: dict[str, int]
-    came: int
+    input_count: int
     table: Array | None = None
     normals: Array | None = None
 
@@ -133,41 +147,41 @@ class Segmented:
 def segment_depth(
     camera: DepthCamera,
     depth: Array,
-    how: Segmentation,
+    stages: Segmentation,
     *,
     mask: Array | None = None,
     colors: Array | None = None,
     robot: Sequence[Mesh] = (),
     grasps: Array | None = None,
-) -> Segmented:
-    """Cloth points of a depth image; see `segment`.
+) -> SegmentedCloud:
+    """Segment the cloth points of a depth image; see ``segment``.
 
     Args:
-        camera: that took it.
+        camera: that took the image.
         depth: [H, W] m, 0 = invalid.
-        how: the stages.
+        stages: of the segmentation.
         mask: [H, W] bool, pixels that may be cloth.
-        colors: [H, W, 3] uint8, of the same pixels (`colors_at` gives those of another camera).
-        robot: meshes of the robot's solids (`solid_meshes`).
+        colors: [H, W, 3] uint8, of the same pixels (``sample_colors`` gives those of another camera).
+        robot: meshes of the robot's solids (``build_solid_meshes``).
         grasps: [G, 3] m, where grippers hold the cloth.
 
     Raises:
-        InvalidInput: an image of another size than the camera's, or a mask or colors of another than the image's.
+        InvalidInput: the depth image has not the camera's size, or mask or colors have not that of the image.
     """
     depth = np.asarray(depth)
     _check_sizes(camera, depth, mask, colors)
-    wanted = has_reading(depth) & np.isfinite(camera.grid[..., 0])
+    wanted = has_reading(depth) & np.isfinite(camera.pixel_rays[..., 0])
     if mask is not None:
         wanted &= np.asarray(mask, dtype=bool)
-    taken = steep(depth, how.edge) & wanted if how.edge else np.zeros_like(wanted)
-    left = wanted & ~taken
-    points = to_points(camera, depth, left)
-    seen = None if colors is None else np.asarray(colors)[left]
+    steep = mask_steep_pixels(depth, stages.max_depth_step) & wanted if stages.max_depth_step else np.zeros_like(wanted)
+    candidates = wanted & ~steep
+    points = to_points(camera, depth, candidates)
+    candidate_colors = None if colors is None else np.asarray(colors)[candidates]
     eye = camera.T_world_camera[:3, 3]
-    found = segment(points, how, colors=seen, robot=robot, grasps=grasps, viewpoint=eye)
-    removed = {"edge": int(taken.sum()), **found.removed} if how.edge else found.removed
-    kept = np.flatnonzero(left[wanted])[found.kept]
-    return Segmented(found.points, kept, removed, int(wanted.sum()), found.table, found.normals)
+    result = segment(points, stages, colors=candidate_colors, robot=robot, grasps=grasps, viewpoint=eye)
+    removed = {"edge": int(steep.sum()), **result.removed} if stages.max_depth_step else result.removed
+    indices = np.flatnonzero(candidates[wanted])[result.indices]
+    return SegmentedCloud(result.points, indices, removed, int(wanted.sum()), result.table, result.normals)
 
 
 def _check_sizes(camera: DepthCamera, depth: Array, mask: Array | None, colors: Array | None) -> None:
@@ -181,159 +195,168 @@ def _check_sizes(camera: DepthCamera, depth: Array, mask: Array | None, colors: 
 
 def segment(
     points: Array,
-    how: Segmentation,
+    stages: Segmentation,
     *,
     colors: Array | None = None,
     robot: Sequence[Mesh] = (),
     grasps: Array | None = None,
     viewpoint: Array | None = None,
-) -> Segmented:
-    """Cloth points of a cloud.
+) -> SegmentedCloud:
+    """Segment the cloth points of a cloud.
 
     Args:
         points: [N, 3] m, world.
-        how: the stages.
-        colors: [N, 3] uint8, needed by ``how.hsv``.
-        robot: meshes of the robot's solids (`solid_meshes`).
+        stages: of the segmentation.
+        colors: [N, 3] uint8, needed by ``stages.hsv_range``.
+        robot: meshes of the robot's solids (``build_solid_meshes``).
         grasps: [G, 3] m, where grippers hold the cloth.
         viewpoint: [3] m, towards which normals point.
 
     Raises:
         MissingDependency: open3d cannot be imported.
-        InvalidInput: points or grasps that are not [N, 3] and finite, or no colours for ``how.hsv``, or
-            colours that are no whole numbers.
+        InvalidInput: points or grasps are not [N, 3] and finite, colours are missing for ``stages.hsv_range``, or
+            colours are not whole numbers.
     """
     points = np.asarray(points, dtype=float)
     if points.ndim != 2 or points.shape[1] != 3 or not np.isfinite(points).all():
         raise InvalidInput("points", got=f"shape {points.shape}", expected="[N, 3], finite, in m")
     _check_grasps(grasps)
-    if how.hsv is not None:
+    if stages.hsv_range is not None:
         _check_colors(np.asarray(colors), points.shape)
-    cloud = _Cloud(points)
-    if how.low is not None or how.high is not None:
-        cloud.keep("crop", lambda p, _: _inside(p, how))
-    if how.hsv is not None:
-        cloud.keep("color", lambda _, index: _of_color(np.asarray(colors)[index], how))
-    if how.robot and len(robot):
-        cloud.keep("robot", lambda p, _: _distance(p, robot) > (how.robot or 0))
-    table = _table(cloud.points, how)
+    cloud = _RemainingPoints(points)
+    if stages.workspace_low is not None or stages.workspace_high is not None:
+        cloud.keep("crop", lambda p, _: _is_in_workspace(p, stages))
+    if stages.hsv_range is not None:
+        cloud.keep("color", lambda _, index: _has_color(np.asarray(colors)[index], stages))
+    if stages.robot_margin and len(robot):
+        cloud.keep("robot", lambda p, _: _signed_distance(p, robot) > (stages.robot_margin or 0))
+    table = _find_table(cloud.points, stages)
     if table is not None:
-        cloud.keep("table", lambda p, _: p @ table[:3] + table[3] > how.above)
-    elif how.table is not None:
-        cloud.removed["table"] = 0  # looked for, and not found
-    if how.neighbours:
-        cloud.keep("outliers", lambda p, _: _sparse(p, how))
-    if how.radius:
-        cloud.keep("lonely", lambda p, _: _accompanied(p, how))
-    if how.gap:
-        cloud.keep("clusters", lambda p, _: _cluster(p, how, grasps))
-    if spacing := how.spacing:
-        cloud.keep("thinned", lambda p, _: np.isin(np.arange(len(p)), spaced(p, spacing)))
-    normals = _normals(cloud.points, how.normals, viewpoint) if how.normals else None
-    return Segmented(cloud.points, cloud.kept, cloud.removed, len(points), table, normals)
+        cloud.keep("table", lambda p, _: p @ table[:3] + table[3] > stages.table_margin)
+    elif stages.table is not None:
+        cloud.removed["table"] = 0  # searched for and not found
+    if stages.outlier_neighbours:
+        cloud.keep("outliers", lambda p, _: _is_no_outlier(p, stages))
+    if stages.isolation_radius:
+        cloud.keep("isolated", lambda p, _: _has_neighbours(p, stages))
+    if stages.cluster_gap:
+        cloud.keep("clusters", lambda p, _: _is_in_cloth_cluster(p, stages, grasps))
+    if spacing := stages.spacing:
+        cloud.keep("thinned", lambda p, _: np.isin(np.arange(len(p)), select_by_spacing(p, spacing)))
+    normals = _estimate_normals(cloud.points, stages.normal_radius, viewpoint) if stages.normal_radius else None
+    return SegmentedCloud(cloud.points, cloud.indices, cloud.removed, len(points), table, normals)
 
 
 def _check_grasps(grasps: Array | None) -> None:
-    """The hand of a pose that was lost is nowhere, and no cluster near it."""
+    """A grasp of NaN is near no cluster, so its cloth would be lost silently."""
     given = np.zeros((0, 3)) if grasps is None else np.asarray(grasps, dtype=float)
     if given.size and (given.ndim != 2 or given.shape[1] != 3 or not np.isfinite(given).all()):
         got = f"shape {given.shape}" if np.isfinite(given).all() else "NaN or infinite places"
-        raise InvalidInput("grasps", got=got, expected="[G, 3], finite, in m", remedy="leave out what is not known")
+        raise InvalidInput("grasps", got=got, expected="[G, 3], finite, in m", remedy="leave out unknown grasps")
 
 
 def _check_colors(colors: Array, shape: tuple[int, ...]) -> None:
     if colors.shape != shape:
         got = "none" if colors.dtype == object else f"shape {colors.shape}"
-        raise InvalidInput("colors", got=got, expected=f"{shape}, since hsv is given")
-    check_bytes("colors", colors)
+        raise InvalidInput("colors", got=got, expected=f"{shape}, since hsv_range is given")
+    check_uint8("colors", colors)
 
 
-class _Cloud:
-    """The points that are left, and who took the others."""
+class _RemainingPoints:
+    """The points that remain, their indices in the input, and how many each stage removed."""
 
     def __init__(self, points: Array) -> None:
-        self.points, self.kept, self.removed = points, np.arange(len(points)), {}
+        self.points, self.indices, self.removed = points, np.arange(len(points)), {}
 
     def keep(self, stage: str, choose: Any) -> None:
-        good = choose(self.points, self.kept) if len(self.points) else np.zeros(0, bool)
+        good = choose(self.points, self.indices) if len(self.points) else np.zeros(0, bool)
         self.removed[stage] = int((~good).sum())
-        self.points, self.kept = self.points[good], self.kept[good]
+        self.points, self.indices = self.points[good], self.indices[good]
 
 
-def _inside(points: Array, how: Segmentation) -> Array:
-    low, high = -np.inf if how.low is None else how.low, np.inf if how.high is None else how.high
+def _is_in_workspace(points: Array, stages: Segmentation) -> Array:
+    low, high = (
+        -np.inf if stages.workspace_low is None else stages.workspace_low,
+        np.inf if stages.workspace_high is None else stages.workspace_high,
+    )
     return np.all((points >= np.asarray(low)) & (points <= np.asarray(high)), axis=1)
 
 
-def _of_color(colors: Array, how: Segmentation) -> Array:
+def _has_color(colors: Array, stages: Segmentation) -> Array:
     from matplotlib.colors import rgb_to_hsv
 
-    low, high = ((0, 0, 0), (1, 1, 1)) if how.hsv is None else how.hsv
+    low, high = ((0, 0, 0), (1, 1, 1)) if stages.hsv_range is None else stages.hsv_range
     hue, *rest = rgb_to_hsv(colors / 255).T
     good = (hue >= low[0]) & (hue <= high[0]) if low[0] <= high[0] else (hue >= low[0]) | (hue <= high[0])
-    for value, least, most in zip(rest, low[1:], high[1:], strict=True):
-        good &= (value >= least) & (value <= most)
+    for value, smallest, largest in zip(rest, low[1:], high[1:], strict=True):
+        good &= (value >= smallest) & (value <= largest)
     return good
 
 
-def _distance(points: Array, meshes: Sequence[Mesh]) -> Array:
-    """[N] m from the nearest of the solids, negative inside; each is a scene of its own, for they overlap."""
-    o3d, found = open3d_or_refuse(), np.full(len(points), np.inf, np.float32)
-    asked = o3d.core.Tensor(points.astype(np.float32))
+def _signed_distance(points: Array, meshes: Sequence[Mesh]) -> Array:
+    """Distance [N] m to the nearest solid, negative inside. Each solid is a scene of its own, for solids overlap."""
+    o3d, distance = import_open3d(), np.full(len(points), np.inf, np.float32)
+    queries = o3d.core.Tensor(points.astype(np.float32))
     for vertices, faces in meshes:
         scene = o3d.t.geometry.RaycastingScene()
         scene.add_triangles(
             o3d.core.Tensor(np.ascontiguousarray(vertices, np.float32)),
             o3d.core.Tensor(np.ascontiguousarray(faces, np.uint32)),
         )
-        found = np.minimum(found, scene.compute_signed_distance(asked).numpy())
-    return found
+        distance = np.minimum(distance, scene.compute_signed_distance(queries).numpy())
+    return distance
 
 
-def _table(points: Array, how: Segmentation) -> Array | None:
-    """The lowest level plane that holds a fair share of the points and has next to nothing under it."""
-    if how.table is None or not isinstance(how.table, str):
-        return None if how.table is None else np.asarray(how.table, dtype=float)
-    o3d = open3d_or_refuse()
+def _find_table(points: Array, stages: Segmentation) -> Array | None:
+    """The lowest level plane that holds a fair share of the points and has next to none below it."""
+    if stages.table is None or not isinstance(stages.table, str):
+        return None if stages.table is None else np.asarray(stages.table, dtype=float)
+    o3d = import_open3d()
     o3d.utility.random.seed(0)
-    left = points
-    for _ in range(TRIES):
-        if len(left) < max(100, 0.02 * len(points)):
+    remaining = points
+    for _ in range(MAX_TABLE_CANDIDATES):
+        if len(remaining) < max(MIN_PLANE_POINTS, MIN_PLANE_FRACTION * len(points)):
             return None
-        plane, inliers = _cloud(left).segment_plane(how.flat, 3, ROUNDS)
-        plane = _refined(np.asarray(plane), left, 2 * how.flat)
+        plane, inliers = _to_open3d(remaining).segment_plane(stages.plane_tolerance, 3, RANSAC_DRAWS)
+        plane = _refine_plane(np.asarray(plane), remaining, 2 * stages.plane_tolerance)
         height = points @ plane[:3] + plane[3]
-        scatter = _scatter(height, how.flat) if plane[2] > LEVEL else None
-        if scatter is not None and (height < -max(3 * how.flat, 4 * scatter)).mean() < UNDER:
+        scatter = _estimate_scatter(height, stages.plane_tolerance) if plane[2] > MIN_TABLE_LEVEL_COSINE else None
+        if (
+            scatter is not None
+            and (height < -max(3 * stages.plane_tolerance, 4 * scatter)).mean() < MAX_FRACTION_UNDER_TABLE
+        ):
             return plane
-        left = np.delete(left, inliers, axis=0)
+        remaining = np.delete(remaining, inliers, axis=0)
     return None
 
 
-def _scatter(height: Array, flat: float) -> float | None:
-    """Standard deviation of the heights about the one plane that there is at 0; None: there is none.
+def _estimate_scatter(height: Array, tolerance: float) -> float | None:
+    """Standard deviation of the heights about a plane at height 0; None if 0 is not the height of a plane.
 
-    Noise of a sensor beyond ``flat`` leaves planes in the tails of the true one, above which points become more and
-    more; and below one through cloth points become fewer first and then more.
+    Sensor noise beyond ``tolerance`` leaves planes in the tails of the true one, above which points become more
+    frequent. Below a plane through cloth, points become less frequent first and then more.
     """
-    count = np.bincount(np.clip(np.rint(height / flat), -FLANK - 1, FLANK + 1).astype(int) + FLANK + 1)
-    count = np.pad(count, (0, 2 * FLANK + 3 - len(count)))[1:-1].astype(float)
-    below, above = count[FLANK::-1], count[FLANK:]  # from the plane on
-    more = lambda side: side[1:] > 1.3 * side[:-1] + 3 * np.sqrt(side[:-1] + 1)  # noqa: E731 - than by chance
-    rising = more(above)
-    if (rising[0] and rising[1]) or more(below).any():
+    count = np.bincount(
+        np.clip(np.rint(height / tolerance), -FLANK_BINS - 1, FLANK_BINS + 1).astype(int) + FLANK_BINS + 1
+    )
+    count = np.pad(count, (0, 2 * FLANK_BINS + 3 - len(count)))[1:-1].astype(float)
+    below, above = count[FLANK_BINS::-1], count[FLANK_BINS:]  # from the plane on
+    rising, falling = (  # away from the plane, by more than chance
+        side[1:] > 1.3 * side[:-1] + 3 * np.sqrt(side[:-1] + 1) for side in (above, below)
+    )
+    if (rising[0] and rising[1]) or falling.any():
         return None
-    near = -height[(height < 0) & (height > -FLANK * flat)]
+    near = -height[(height < 0) & (height > -FLANK_BINS * tolerance)]
     scatter = float(1.4826 * np.median(near)) if len(near) else 0.0
-    return scatter if scatter < NOISE * flat else None  # folds of cloth scatter more
+    return scatter if scatter < MAX_TABLE_SCATTER_RATIO * tolerance else None  # folds of cloth scatter more
 
 
-def _refined(plane: Array, points: Array, band: float) -> Array:
-    """Least squares on what lies within ``band`` m of the plane, repeated; the normal points upwards.
+def _refine_plane(plane: Array, points: Array, band: float) -> Array:
+    """Least squares on the points within ``band`` m of the plane, repeated; the normal points upwards.
 
-    The draws of RANSAC come in another order in every run: from any of its planes this leads to the same one.
+    The draws of RANSAC come in another order in every run. From any of its planes this leads to the same one.
     """
-    for _ in range(REFITS):
+    for _ in range(PLANE_REFITS):
         near = points[np.abs(points @ plane[:3] + plane[3]) < band * np.linalg.norm(plane[:3])]
         if len(near) < 3:
             break
@@ -343,37 +366,37 @@ def _refined(plane: Array, points: Array, band: float) -> Array:
     return plane * np.sign(plane[2] or 1.0) / np.linalg.norm(plane[:3])
 
 
-def _sparse(points: Array, how: Segmentation) -> Array:
-    _, good = _cloud(points).remove_statistical_outlier(how.neighbours, how.deviations)
+def _is_no_outlier(points: Array, stages: Segmentation) -> Array:
+    _, good = _to_open3d(points).remove_statistical_outlier(stages.outlier_neighbours, stages.outlier_deviations)
     return np.isin(np.arange(len(points)), good)
 
 
-def _accompanied(points: Array, how: Segmentation) -> Array:
-    _, good = _cloud(points).remove_radius_outlier(how.company, how.radius)
+def _has_neighbours(points: Array, stages: Segmentation) -> Array:
+    _, good = _to_open3d(points).remove_radius_outlier(stages.isolation_neighbours, stages.isolation_radius)
     return np.isin(np.arange(len(points)), good)
 
 
-def _cluster(points: Array, how: Segmentation, grasps: Array | None) -> Array:
-    label = np.asarray(_cloud(points).cluster_dbscan(how.gap, how.crowd))
+def _is_in_cloth_cluster(points: Array, stages: Segmentation, grasps: Array | None) -> Array:
+    label = np.asarray(_to_open3d(points).cluster_dbscan(stages.cluster_gap, stages.cluster_core_points))
     if (label < 0).all():
         return label >= 0
     if grasps is None or len(grasps) == 0:
         return np.equal(label, np.bincount(label[label >= 0]).argmax())
-    near = (np.linalg.norm(points[:, None] - np.asarray(grasps), axis=-1) < how.reach).any(1)
+    near = (np.linalg.norm(points[:, None] - np.asarray(grasps), axis=-1) < stages.grasp_distance).any(1)
     return np.isin(label, np.unique(label[near & (label >= 0)]))
 
 
-def _normals(points: Array, radius: float, viewpoint: Array | None) -> Array:
+def _estimate_normals(points: Array, radius: float, viewpoint: Array | None) -> Array:
     if len(points) == 0:
         return np.zeros((0, 3))
-    o3d = open3d_or_refuse()
-    cloud = _cloud(points)
-    cloud.estimate_normals(o3d.geometry.KDTreeSearchParamHybrid(radius, 30))
+    o3d = import_open3d()
+    cloud = _to_open3d(points)
+    cloud.estimate_normals(o3d.geometry.KDTreeSearchParamHybrid(radius, MAX_NORMAL_NEIGHBOURS))
     if viewpoint is not None:
         cloud.orient_normals_towards_camera_location(np.asarray(viewpoint, dtype=float))
     return np.asarray(cloud.normals).reshape(-1, 3)
 
 
-def _cloud(points: Array) -> Any:
-    o3d = open3d_or_refuse()
+def _to_open3d(points: Array) -> Any:
+    o3d = import_open3d()
     return o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points))

@@ -1,4 +1,4 @@
-"""What is known of a cloth's shape unseen: edges keep their length, it bends little, layers stay together."""
+"""A prior of a cloth's shape: edges keep their length, the cloth bends little, and layers stay together."""
 
 from __future__ import annotations
 
@@ -7,16 +7,22 @@ import torch
 from torch import Tensor
 
 from ..meshes import Mesh
-from .least_squares import Equations, along_axes
+from .least_squares import Equations, expand_to_axes
 
-SHARPEST = np.pi / 3  # rad; sharper edges of the placement are folds and keep no shape
-LAYER = 0.6  # mean edges; vertices of other parts nearer than this lie on each other
-GIVE = 0.005  # m, standard deviation of the distance between layers
-CURVATURE = 5.0  # 1/m, standard deviation of a cloth's curvature, averaged over an edge
+MAX_HINGE_ANGLE_RAD = np.pi / 3  # sharper edges of the placement are folds, and their angle is free
+LAYER_DISTANCE_RATIO = 0.6  # of the mean edge length; vertices of other parts that are nearer lie on each other
+LAYER_DISTANCE_STD_M = 0.005  # of the distance between layers
+CURVATURE_STD_PER_M = 5.0  # of a cloth's curvature, averaged over an edge
 
 
 class ShapePrior:
-    """Equations in standard deviations, for vertices of ``mesh`` that lay at ``start`` [V, 3] m before."""
+    """Least-squares equations, in standard deviations, for the vertices of a mesh.
+
+    Args:
+        mesh: the cloth.
+        start: [V, 3] m, placement of the vertices whose shape is the prior's mean.
+        strain: standard deviation of the strain of an edge.
+    """
 
     def __init__(self, mesh: Mesh, start: Tensor, strain: float) -> None:
         self.strain = strain
@@ -25,14 +31,14 @@ class ShapePrior:
         self.edges, self.length = torch.as_tensor(edges), torch.as_tensor(length)
         corners, weights, angle = _hinges(mesh, start.numpy())
         self.corners, self.weights = torch.as_tensor(corners), torch.as_tensor(weights / angle[:, None])
-        self.pairs = torch.as_tensor(_layers(start.numpy(), edges, LAYER * mesh.mean_edge))
+        self.pairs = torch.as_tensor(_layers(start.numpy(), edges, LAYER_DISTANCE_RATIO * mesh.mean_edge))
 
-    def stretch(self, x: Tensor) -> Tensor:
-        """[N] strain of the edges."""
+    def edge_strain(self, x: Tensor) -> Tensor:
+        """Return the strain [N] of the edges."""
         return (x[self.edges[:, 1]] - x[self.edges[:, 0]]).norm(dim=-1) / self.length - 1
 
     def local_rotations(self, x: Tensor) -> Tensor:
-        """[V, 3, 3] best rotations of each vertex's edges from the start (Sorkine and Alexa 2007)."""
+        """Return the best rotations [V, 3, 3] of each vertex's edges from the start (Sorkine and Alexa 2007)."""
         i, j = torch.cat([self.edges, self.edges.flip(1)]).T
         outer = (x[j] - x[i]).unsqueeze(-1) * (self.start[j] - self.start[i]).unsqueeze(-2)
         U, _, Vh = torch.linalg.svd(x.new_zeros(len(x), 3, 3).index_add(0, i, outer))
@@ -41,23 +47,27 @@ class ShapePrior:
         return (U * sign) @ Vh
 
     def equations(self, x: Tensor) -> list[Equations]:
-        """Linearised at ``x``; the layers' offsets turn with the vertices."""
+        """Return the equations linearised at ``x`` [V, 3] m; offsets between layers turn with the vertices."""
         i, j = self.edges.T
-        along = (x[j] - x[i]) / (self.length * (1 + self.stretch(x))).unsqueeze(-1)
+        along = (x[j] - x[i]) / (self.length * (1 + self.edge_strain(x))).unsqueeze(-1)
         pull = along / (self.length * self.strain).unsqueeze(-1)
         bend = (self.weights.unsqueeze(-1) * x[self.corners]).sum(1)
         upper, lower = self.pairs.T
         offset = self.start[lower] - self.start[upper]
         offset = (self.local_rotations(x)[upper] @ offset.unsqueeze(-1)).squeeze(-1)
         return [
-            Equations(self.edges, torch.stack([-pull, pull], dim=1), -self.stretch(x) / self.strain),
-            *along_axes(self.corners, self.weights, -bend),
-            *along_axes(self.pairs, x.new_tensor([-1.0, 1.0]) / GIVE, (offset - x[lower] + x[upper]) / GIVE),
+            Equations(self.edges, torch.stack([-pull, pull], dim=1), -self.edge_strain(x) / self.strain),
+            *expand_to_axes(self.corners, self.weights, -bend),
+            *expand_to_axes(
+                self.pairs,
+                x.new_tensor([-1.0, 1.0]) / LAYER_DISTANCE_STD_M,
+                (offset - x[lower] + x[upper]) / LAYER_DISTANCE_STD_M,
+            ),
         ]
 
 
 def _edges(mesh: Mesh) -> tuple[np.ndarray, np.ndarray]:
-    """(edges [N, 2], rest lengths [N] m)."""
+    """Edges [N, 2] and their rest lengths [N] m."""
     sides = np.sort(mesh.faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
     length = np.linalg.norm(mesh.rest[:, [1, 2, 0]] - mesh.rest, axis=-1).ravel()
     edges, first = np.unique(sides, axis=0, return_index=True)
@@ -65,9 +75,10 @@ def _edges(mesh: Mesh) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _hinges(mesh: Mesh, x: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Corners a, b, c, d [N, 4] of neighbours abc and bad, weights [N, 4] 1/m of their angle, its deviation [N] rad.
+    """Bending equations of neighbouring triangles abc and bad.
 
-    The angle is how far d lies off the plane of abc, over its height above the edge ab; shapes come from ``rest``.
+    Returns corners a, b, c, d [N, 4], weights [N, 4] 1/m of their angle, and its standard deviation [N] rad. The angle
+    is the distance of d from the plane of abc over its height above the edge ab. Shapes come from ``rest``.
     """
     half: dict[tuple[int, int], tuple[int, float, float]] = {}
     for face, rest in zip(mesh.faces.tolist(), mesh.rest, strict=True):
@@ -83,13 +94,13 @@ def _hinges(mesh: Mesh, x: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarr
             s = 1 - s
             corners.append((a, b, c, d))
             weights.append(((s - 1) / g + (t - 1) / h, -s / g - t / h, 1 / h, 1 / g))
-            angle.append(CURVATURE * (h + g) / 3)
+            angle.append(CURVATURE_STD_PER_M * (h + g) / 3)
     if not corners:
         return np.zeros((0, 4), int), np.zeros((0, 4)), np.zeros(0)
-    found = np.array(corners), np.array(weights), np.array(angle)
-    size = np.linalg.norm((found[1][..., None] * x[found[0]]).sum(1), axis=-1)
-    kept = size < 2 * np.sin(SHARPEST / 2)
-    return found[0][kept], found[1][kept], found[2][kept]
+    vertices, coefficients, std = np.array(corners), np.array(weights), np.array(angle)
+    size = np.linalg.norm((coefficients[..., None] * x[vertices]).sum(1), axis=-1)
+    is_smooth = size < 2 * np.sin(MAX_HINGE_ANGLE_RAD / 2)
+    return vertices[is_smooth], coefficients[is_smooth], std[is_smooth]
 
 
 def _layers(x: np.ndarray, edges: np.ndarray, near: float) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""Triangle meshes of simple solids, so that robots and furniture can hide things from a camera."""
+"""Triangle meshes of simple solids, so that robots and furniture can occlude cloth from a camera."""
 
 from __future__ import annotations
 
@@ -18,78 +18,82 @@ _BOX_FACES = np.array(
 
 
 class Solid(Protocol):
-    """A primitive in its place, for example one of ``robots.Scene.geometry(q)``."""
+    """A primitive solid at its place, for example one of ``robots.Scene.geometry(q)``."""
 
     @property
     def kind(self) -> str:
-        """Box, cylinder or sphere."""
+        """Kind of the solid: box, cylinder or sphere."""
         ...
 
     @property
     def size(self) -> tuple[float, ...]:
-        """In m, as in `solid_mesh`."""
+        """Size in m, as in ``build_solid_mesh``."""
         ...
 
     @property
     def pose(self) -> Any:
-        """[..., 4, 4] of the centre in the world, m."""
+        """Pose [..., 4, 4] m of the centre in the world."""
         ...
 
 
-def solid_meshes(solids: Iterable[Solid], at: int | None = None) -> list[tuple[Array, Array]]:
-    """Meshes of a robot's primitives: ``solid_meshes(scene.geometry(q), at=k)``.
+def build_solid_meshes(solids: Iterable[Solid], at: int | None = None) -> list[tuple[Array, Array]]:
+    """Build meshes of a robot's primitives: ``build_solid_meshes(scene.geometry(q), at=k)``.
 
     Args:
-        solids: with kind, size (see `solid_mesh`) and pose, a tensor or array [4, 4] or, of many moments, [K, 4, 4].
-        at: which of the moments; None where there is only one.
+        solids: with kind, size (see ``build_solid_mesh``) and pose, a tensor or array [4, 4], or [K, 4, 4] at K times.
+        at: index of the time; None if there is only one.
     """
     placed = []
     for solid in solids:
         pose = solid.pose.detach().cpu().numpy() if hasattr(solid.pose, "detach") else np.asarray(solid.pose)
-        placed.append(solid_mesh(solid.kind, solid.size, pose if at is None else pose[at]))
+        placed.append(build_solid_mesh(solid.kind, solid.size, pose if at is None else pose[at]))
     return placed
 
 
-def solid_mesh(kind: str, size: tuple[float, ...], pose: Array, segments: int = 24) -> tuple[Array, Array]:
-    """Vertices [V, 3] m in the world and triangles [F, 3] of a box, a cylinder or a sphere.
+def build_solid_mesh(kind: str, size: tuple[float, ...], pose: Array, segments: int = 24) -> tuple[Array, Array]:
+    """Build vertices [V, 3] m in the world and triangles [F, 3] of a box, a cylinder or a sphere.
 
     Args:
         kind: "box", "cylinder" or "sphere".
         size: m; box: edges x, y, z; cylinder: radius, length along z; sphere: radius.
-        pose: [4, 4] of the centre in the world, m, of one moment.
-        segments: corners of a circle; the mesh lies inside the true solid by up to radius * (1 - cos(pi / segments)),
-            of a sphere twice that.
+        pose: [4, 4] m, of the centre in the world, at one time.
+        segments: corners of a circle. The mesh lies inside the true solid by up to radius * (1 - cos(pi / segments));
+            for a sphere, by twice that.
 
     Raises:
-        InvalidInput: an unknown kind, sizes that do not fit it, or poses of many moments.
+        InvalidInput: an unknown kind, sizes that do not fit it, or poses at several times.
     """
-    wanted = {"box": 3, "cylinder": 2, "sphere": 1}
-    if kind not in wanted:
-        raise InvalidInput("kind", got=repr(kind), expected=f"one of {', '.join(wanted)}")
-    if len(size) != wanted[kind] or not all(0 < length < np.inf for length in size) or segments < 3:
-        raise InvalidInput("size", got=size, expected=f"{wanted[kind]} positive lengths in m", remedy="segments >= 3")
+    size_counts = {"box": 3, "cylinder": 2, "sphere": 1}
+    if kind not in size_counts:
+        raise InvalidInput("kind", got=repr(kind), expected=f"one of {', '.join(size_counts)}")
+    if len(size) != size_counts[kind] or not all(0 < length < np.inf for length in size) or segments < 3:
+        raise InvalidInput(
+            "size", got=size, expected=f"{size_counts[kind]} positive lengths in m", remedy="segments >= 3"
+        )
     if kind == "box":
         vertices, faces = _BOX * np.asarray(size, float), _BOX_FACES
     else:
-        vertices, faces = _turned(*_outline(kind, size, segments), segments)
+        vertices, faces = _revolve(*_outline(kind, size, segments), segments)
     pose = np.asarray(pose, dtype=float)
     if pose.shape != (4, 4):
         got = f"shape {pose.shape}"
-        raise InvalidInput("pose", got=got, expected="[4, 4] of one moment", remedy="of many: solid_meshes(..., at=k)")
+        raise InvalidInput(
+            "pose", got=got, expected="[4, 4] at one time", remedy="for several times: build_solid_meshes(..., at=k)"
+        )
     if not np.isfinite(pose).all():
         raise InvalidInput("pose", got="NaN or infinite entries", expected="a rigid pose [R p; 0 1]")
     return vertices @ pose[:3, :3].T + pose[:3, 3], faces
 
 
 def _outline(kind: str, size: tuple[float, ...], segments: int) -> tuple[Array, Array]:
-    """Radius and height [N] of the curve that turns about z; it starts and ends on the axis."""
+    """Radius and height [N] of the curve that is revolved about z; it starts and ends on the axis."""
     if kind == "cylinder":
         return np.array([0, size[0], size[0], 0]), size[1] * np.array([-0.5, -0.5, 0.5, 0.5])
     angle = np.linspace(0, np.pi, max(2, (segments + 1) // 2) + 1)
     return size[0] * np.sin(angle), -size[0] * np.cos(angle)
 
 
-def _turned(radius: Array, height: Array, segments: int) -> tuple[Array, Array]:
+def _revolve(radius: Array, height: Array, segments: int) -> tuple[Array, Array]:
     angle = 2 * np.pi * np.arange(segments) / segments
     ring = np.stack([np.cos(angle), np.sin(angle)], -1)
     flat = radius[:, None, None] * ring

@@ -1,4 +1,4 @@
-"""What an active stereo camera does to a perfect depth image."""
+"""Errors of active stereo cameras."""
 
 from __future__ import annotations
 
@@ -9,27 +9,27 @@ from typing import ClassVar
 import numpy as np
 
 from ..errors import InvalidInput
-from .noise import AbstractNoise, check_fields, neighbourhood, smooth_field
+from .noise import AbstractNoise, check_fields, depth_range, draw_smooth_field
 
 Array = np.ndarray
 
 
 @dataclass(frozen=True)
 class StereoNoise(AbstractNoise):
-    """Errors of disparity: sub-pixel noise in patches, steps, fattened edges, shadows, holes; and a wrong scale.
+    """Errors of disparity: sub-pixel noise in patches, quantisation, fattened edges, shadows, holes; and a wrong scale.
 
-    Depth is z = f b / d, so an error of disparity e becomes z^2 e / (f b). The defaults are a RealSense D435 at
-    848 x 480: b = 50 mm (Intel, "RealSense D400 series datasheet"), f = 424 px, sub-pixel error 0.08 px (Intel, "Tuning
-    depth cameras for best performance", gives RMS = z^2 sub-pixel / (f b), and below 0.1 px as what a well-tuned camera
-    reaches), steps of 1/32 px (Intel, "Subpixel linearity improvement"). Patch size, fattening and holes are working
-    values of ours: the matcher compares windows of several pixels, so that its errors are alike over as many.
+    Depth is z = f b / d, so an error of disparity e becomes z^2 e / (f b). The defaults are a RealSense D435 at 848 x
+    480: b = 50 mm (Intel, "RealSense D400 series datasheet"), f = 424 px, sub-pixel error 0.08 px (Intel, "Tuning depth
+    cameras for best performance", gives RMS = z^2 sub-pixel / (f b), and below 0.1 px for a well-tuned camera), steps
+    of 1/32 px (Intel, "Subpixel linearity improvement"). Patch size, fattening and holes are working values of ours:
+    the matcher compares windows of several pixels, so that its errors are correlated over as many.
 
     Attributes:
         focal: px, focal length.
-        baseline: m, between the imagers; the depth image is the left one's.
+        baseline: m, between the imagers; the depth image is that of the left one.
         subpixel: px, standard deviation of the disparity.
-        patch: px, standard deviation of the Gaussian over which the disparity's error is alike (0: every pixel alone).
-        step: px, disparities come in multiples of it (0: any).
+        patch: px, standard deviation of the Gaussian over which the disparity's error is correlated (0: not at all).
+        step: px, disparities are multiples of it (0: continuous).
         fattening: px, by how much a nearer surface spreads over what is behind it.
         edge: px, difference in disparity that makes an edge.
         holes: share of the pixels that are lost, in spots of about ``patch``.
@@ -62,59 +62,60 @@ class StereoNoise(AbstractNoise):
         if self.bias_length < 1:
             raise InvalidInput("bias_length", got=self.bias_length, expected="at least 1 px")
 
-    leading: ClassVar[tuple[int, ...]] = (2,)
+    bias_leading_shape: ClassVar[tuple[int, ...]] = (2,)
 
     @classmethod
     def d435(cls) -> StereoNoise:
-        """With the bias of a device out of the box: scale 1.93 % (one sigma) and 0.1 px of warp.
+        """Return the noise with the bias of a device out of the box: scale 1.93 % (one sigma) and 0.1 px of warp.
 
         One D435 read 980.7 mm at 1000 mm, averaged over a million readings (calvert.ch, "Improving the depth map
-        accuracy of RealSense cameras", 2018); other devices differ, hence a standard deviation. The warp is our guess.
+        accuracy of RealSense cameras", 2018). Other devices differ, hence a standard deviation. The warp is our guess.
         """
         return cls(bias_scale=0.0193, bias_disparity=0.1)
 
     def without_bias(self) -> StereoNoise:
-        """The same with random errors only."""
+        """Return the same noise with random errors only."""
         return replace(self, bias_scale=0.0, bias_disparity=0.0)
 
     @property
-    def biased(self) -> bool:
+    def has_bias(self) -> bool:
         """Whether an image needs a bias field."""
         return bool(self.bias_scale or self.bias_disparity)
 
     def sigma(self, depth: Array) -> Array:
-        """Standard deviation [...] m of the random error at depths [...] m; steps of disparity count as uniform."""
+        """Return the standard deviation [...] m of the random error at depths [...] m, with quantisation."""
         disparity = np.hypot(self.subpixel, self.step / np.sqrt(12))
         return np.asarray(depth) ** 2 * disparity / (self.focal * self.baseline)
 
     def bias_field(self, shape: tuple[int, int], rng: np.random.Generator) -> Array:
-        """The device's error [2, H, W]: of depth, relative and the same everywhere, and of disparity, px."""
+        """Draw the device's error [2, H, W]: of depth, relative and the same everywhere, and of disparity [px]."""
         scale = np.full(shape, self.bias_scale * rng.standard_normal())
-        return np.stack([scale, self.bias_disparity * smooth_field(shape, self.bias_length, rng)])
+        return np.stack([scale, self.bias_disparity * draw_smooth_field(shape, self.bias_length, rng)])
 
     def apply(self, depth: Array, rng: np.random.Generator, bias: Array | None = None) -> Array:
-        """A noisy copy [H, W] float32 m of a depth image [H, W] m, see :meth:`AbstractNoise.apply`."""
-        depth = self.checked(depth, bias)
+        """Return a noisy copy [H, W] float32 m of a depth image [H, W] m, see :meth:`AbstractNoise.apply`."""
+        depth = self.validate_image(depth, bias)
         scale, warp = (0.0, 0.0) if bias is None else bias
         true = np.divide(self.focal * self.baseline, depth, out=np.zeros(depth.shape), where=depth > 0)
-        nearest = _largest(true, self.fattening)
+        nearest = _max_disparity(true, self.fattening)
         surface = np.where(nearest - true > self.edge, nearest, true)
-        matched = surface + warp + self.subpixel * patches(depth.shape, self.patch, rng)
+        matched = surface + warp + self.subpixel * draw_patch_noise(depth.shape, self.patch, rng)
         if self.step:
             matched = np.rint(matched / self.step) * self.step
-        lost = shadow(true, self.edge) & (matched - true < self.edge)
+        is_lost = mask_stereo_shadow(true, self.edge) & (matched - true < self.edge)
         if self.holes:
-            lost |= patches(depth.shape, self.patch, rng) < NormalDist().inv_cdf(self.holes)
-        good = (matched > 0) & (surface > 0) & ~lost
+            is_lost |= draw_patch_noise(depth.shape, self.patch, rng) < NormalDist().inv_cdf(self.holes)
+        good = (matched > 0) & (surface > 0) & ~is_lost
         z = np.divide(self.focal * self.baseline, matched, out=np.zeros(depth.shape), where=good)
         return (z * (1 + scale)).astype(np.float32)
 
 
-def shadow(disparity: Array, edge: float = 1.0) -> Array:
-    """Pixels [H, W] of the left image that the right one cannot see: hidden by something nearer, or out of its view.
+def mask_stereo_shadow(disparity: Array, edge: float = 1.0) -> Array:
+    """Return the pixels [H, W] of the left image that the right one cannot see: occluded, or out of its view.
 
-    Left column u is seen in the right image at u - d. Of all that fall on one place there, what is ``edge`` px nearer
-    hides the rest: a band to the left of every near edge, as wide as the step in disparity, and the image's left rim.
+    Left column u is seen in the right image at u - d. Of all pixels that fall on one place there, one that is ``edge``
+    px nearer hides the rest. This makes a band to the left of every near edge, as wide as the step in disparity, and a
+    band at the image's left rim.
     """
     height, width = disparity.shape
     column = np.rint(np.arange(width) - disparity).astype(int)
@@ -125,8 +126,8 @@ def shadow(disparity: Array, edge: float = 1.0) -> Array:
     return ~inside | (front[row, np.maximum(column, 0)] - disparity > edge)
 
 
-def patches(shape: tuple[int, int], size: float, rng: np.random.Generator) -> Array:
-    """White noise [H, W] smoothed by a Gaussian of ``size`` px, of unit variance; the image's rims join."""
+def draw_patch_noise(shape: tuple[int, int], size: float, rng: np.random.Generator) -> Array:
+    """Draw white noise [H, W] smoothed by a Gaussian of ``size`` px, of unit variance, periodic over the image."""
     white = rng.standard_normal(shape)
     if size == 0:
         return white
@@ -136,7 +137,7 @@ def patches(shape: tuple[int, int], size: float, rng: np.random.Generator) -> Ar
     return np.fft.irfft2(np.fft.rfft2(white) * smooth, shape) / np.sqrt((impulse**2).sum())
 
 
-def _largest(disparity: Array, reach: int) -> Array:
+def _max_disparity(disparity: Array, reach: int) -> Array:
     """Largest disparity within ``reach`` px."""
-    near, _ = neighbourhood(np.divide(1.0, disparity, out=np.zeros(disparity.shape), where=disparity > 0), reach)
+    near, _ = depth_range(np.divide(1.0, disparity, out=np.zeros(disparity.shape), where=disparity > 0), reach)
     return np.where(np.isfinite(near), 1 / near, 0.0)

@@ -1,4 +1,4 @@
-"""A sensor in its place: what it reports of a cloth with other things in its way."""
+"""A sensor at its place: what it reports of a cloth with occluders around it."""
 
 from __future__ import annotations
 
@@ -23,22 +23,22 @@ class View:
     """A depth camera with its errors, and how its images become points.
 
     Attributes:
-        camera: the camera in its place.
+        camera: the camera at its place.
         noise: its errors; None: an ideal sensor.
-        rim: px, taken off the cloth's mask.
-        points: at most so many a frame, drawn at random; None: all.
+        mask_erosion: px, removed from the rim of the cloth's mask.
+        max_points: largest number of points of a frame, drawn at random; None: all.
         bias: [..., H, W] the device's own error; draw it once per device by :meth:`with_bias`.
     """
 
     camera: DepthCamera
     noise: AbstractNoise | None = None
-    rim: int = 2
-    points: int | None = None
+    mask_erosion: int = 2
+    max_points: int | None = None
     bias: Array | None = None
 
     def with_bias(self, rng: np.random.Generator) -> View:
-        """The same view through one device: with a bias drawn for it, where its noise has one."""
-        if self.noise is None or not self.noise.biased:
+        """Return the same view through one device: with a bias drawn for it, if its noise has one."""
+        if self.noise is None or not self.noise.has_bias:
             return self
         return replace(self, bias=self.noise.bias_field((self.camera.height, self.camera.width), rng))
 
@@ -58,13 +58,13 @@ class Capture(NamedTuple):
 
 
 def capture(view: View, x: Array, faces: Array, occluders: Sequence[Mesh] = (), *, rng: np.random.Generator) -> Capture:
-    """What a view reports of a cloth.
+    """Compute what a view reports of a cloth.
 
     Args:
         view: camera, noise, and how points are made.
         x: [V, 3] m, the cloth's vertices in the world.
-        faces: [F, 3] its triangles.
-        occluders: vertices [V, 3] m and triangles [F, 3] of all else: robot (`solid_meshes`), table, walls.
+        faces: [F, 3], its triangles.
+        occluders: vertices [V, 3] m and triangles [F, 3] of all else: robot (``build_solid_meshes``), table, walls.
         rng: source of the noise and of the points that are drawn.
 
     Raises:
@@ -72,19 +72,19 @@ def capture(view: View, x: Array, faces: Array, occluders: Sequence[Mesh] = (), 
         InvalidInput: a mesh that cannot be rendered, or a noise that needs a bias (see :meth:`View.with_bias`).
     """
     clean, ids = render_depth(view.camera, [(x, faces), *occluders])
-    mask = erode(ids == 0, view.rim)
+    mask = erode(ids == 0, view.mask_erosion)
     depth = clean if view.noise is None else view.noise.apply(clean, rng, view.bias)
     points = to_points(view.camera, depth, mask)
-    return Capture(depth, mask, points if view.points is None else thin_to_count(points, view.points, rng))
+    return Capture(depth, mask, points if view.max_points is None else thin_to_count(points, view.max_points, rng))
 
 
-def encode(depth: Array, depth_scale: float = 0.001) -> Array:
-    """A depth image [H, W] m as a camera writes it: uint16 [H, W] in units of ``depth_scale`` m, 0 = invalid.
+def encode_depth(depth: Array, depth_scale: float = 0.001) -> Array:
+    """Encode a depth image [H, W] m as a camera writes it: uint16 [H, W] in units of ``depth_scale`` m, 0 = invalid.
 
-    A pixel without a reading (NaN), and what lies beyond the largest number, is invalid: 0 says so in this format.
+    A pixel without a reading (NaN) and a depth beyond the largest number become 0, which means invalid.
 
     Raises:
-        InvalidInput: a scale that is not positive, or whole numbers, which are no metres.
+        InvalidInput: a scale that is not positive, or integers, which are not metres.
     """
     _check_scale(depth_scale)
     has_reading(np.asarray(depth))
@@ -97,8 +97,8 @@ def _check_scale(depth_scale: float) -> None:
         raise InvalidInput("depth_scale", got=depth_scale, expected="a positive length in m per unit")
 
 
-def decode(image: Array, depth_scale: float = 0.001) -> Array:
-    """Depth [H, W] float32 m of a stored image [H, W] in units of ``depth_scale`` m, 0 = invalid.
+def decode_depth(image: Array, depth_scale: float = 0.001) -> Array:
+    """Decode a stored image [H, W] in units of ``depth_scale`` m to depth [H, W] float32 m, 0 = invalid.
 
     Raises:
         InvalidInput: a scale that is not positive.
