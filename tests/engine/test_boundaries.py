@@ -91,7 +91,7 @@ def path(scenes: tuple[int, ...] = (), closed=(True, True, True)) -> tc.Trajecto
 
 
 def moves(cloth: tc.Cloth, scenes: tuple[int, ...] = ()) -> dict[str, tc.Trajectory]:
-    return {name: path(scenes) for name, boundary in cloth.boundaries.items() if boundary.driven}
+    return {name: path(scenes) for name, boundary in cloth.boundaries.items() if boundary.is_prescribed}
 
 
 def watched(monkeypatch) -> dict[str, bool]:
@@ -105,7 +105,7 @@ def watched(monkeypatch) -> dict[str, bool]:
             seen["slips"] |= bool((share[push > 0] < 1).any())
         return share
 
-    monkeypatch.setattr(Coulomb, "taken", watch)
+    monkeypatch.setattr(Coulomb, "slip_reduction", watch)
     return seen
 
 
@@ -143,7 +143,7 @@ def run(cloth, state, substeps=20):
     times = torch.linspace(0, 1e-4 * substeps, substeps + 1, dtype=torch.float64)
     drives = {name: sample_trajectory(trajectory, times) for name, trajectory in moves(cloth).items()}
     with torch.no_grad():
-        return fused.rollout(cloth.model(), state, 1e-4, drives, substeps)[0]
+        return fused.rollout(cloth.build_model(), state, 1e-4, drives, substeps)[0]
 
 
 def test_no_fast_point_is_missed():
@@ -231,7 +231,7 @@ def test_contact_does_not_hang_on_rounding():
     state = falling(cloth, 2e-3, (3,))
     near = state._replace(x=state.x * (1 + 1e-14))
     with torch.no_grad():
-        ends = [substep.rollout(cloth.model(), s, 1e-4, {}, 100)[0].v for s in (state, near)]
+        ends = [substep.rollout(cloth.build_model(), s, 1e-4, {}, 100)[0].v for s in (state, near)]
     assert float((ends[0] - ends[1]).norm() / ends[0].norm()) < 1e-11
 
 
@@ -247,7 +247,7 @@ class Greasy(Coulomb):
 def test_what_users_write_is_named(boundary, named):
     cloth = sheet({"mine": boundary})
     with pytest.raises(Unfused, match=f"'mine'.*{named}"):
-        fused.rollout(cloth.model(), cloth.rest_state(), 1e-4, {}, 1)
+        fused.rollout(cloth.build_model(), cloth.rest_state(), 1e-4, {}, 1)
 
 
 def test_float32():
@@ -257,7 +257,7 @@ def test_float32():
         torch.set_default_dtype(dtype)
         cloth = sheet({"box": SMALL["box"](sampling=0.01)})
         state = falling(cloth.double(), 5e-4).map(lambda t, dtype=dtype: t.to(dtype).requires_grad_())
-        end = fused.rollout(cloth.to(dtype).model(), state, 1e-4, {}, 200)[0]
+        end = fused.rollout(cloth.to(dtype).build_model(), state, 1e-4, {}, 200)[0]
         (100 * end.x.square().sum() + end.v.square().sum()).backward()
         found.append(torch.cat([state.x.grad.flatten() * 1e-4, state.v.grad.flatten()]).double())
     assert float((found[0] - found[1]).norm() / found[1].norm()) < 1e-3

@@ -1,4 +1,4 @@
-"""Physical effects on the bare membrane, one per file, keyed by name. They add, so their order cannot matter."""
+"""Physical effects on the bare membrane, one per file. Their forces add, so their order does not matter."""
 
 from .added_mass import AddedMass
 from .adhesion import Adhesion

@@ -10,32 +10,39 @@ import numpy as np
 
 from ..meshes import Mesh
 
-MAX_RING_GROWTHS = 3  # rings of triangles that may be added to a vertex's own
+MAX_RING_GROWTHS = 3  # rings of triangles that may be added to a vertex's own ring
 MIN_SINGULAR_VALUE_RATIO = 0.15  # smallest over largest singular value of a fit that needs no more neighbours
 
 
 class CurvatureStencils(NamedTuple):
-    """Derivatives of a field f at every vertex v: sum_n weight_n (f_n - f_v). Rows are padded with v, weight 0."""
+    """Derivatives of a field f at every vertex v: sum_n weight_n (f_n - f_v).
 
-    neighbours: np.ndarray  # [V, N] int
-    second: np.ndarray  # [V, N, 3] 1/m^2, along ww, ff, and sqrt 2 times wf
-    first: np.ndarray  # [V, N, 2] 1/m, along w, f
+    Attributes:
+        neighbours: [V, N] int; rows are padded with v, at weight 0.
+        second: [V, N, 3] 1/m^2, weights of the second derivatives along ww, ff, and sqrt 2 times wf.
+        first: [V, N, 2] 1/m, weights of the first derivatives along w and f.
+    """
+
+    neighbours: np.ndarray
+    second: np.ndarray
+    first: np.ndarray
 
 
-@lru_cache(maxsize=8)  # of the last meshes: variants of a model share theirs
+@lru_cache(maxsize=8)  # variants of a model share their mesh
 def curvature_stencils(mesh: Mesh) -> CurvatureStencils:
-    """First and second derivatives at every vertex; not to be written to.
+    """Compute stencils of the first and second derivatives at every vertex. Do not write to the result: it is cached.
 
-    They come from a least-squares quadratic through the
-    vertex over its ring, weighted by 1 / distance^4 (residuals count as the curvature they make); the ring grows by the
-    triangles beyond its edges where it does not determine the quadratic (rim, valence 4). What stays undetermined (a
-    strip of one cell) is taken as 0. Quadratics are differentiated exactly and linear functions give 0 on any mesh.
+    They come from a least-squares quadratic through the vertex over its ring, weighted by 1 / distance^4 (residuals
+    count as the curvature they make). Where the ring does not determine the quadratic (rim, valence 4), it grows by the
+    triangles beyond its edges. What stays undetermined (a strip of one cell) is taken as 0. Quadratics are
+    differentiated exactly, and linear functions give 0 on any mesh.
+
     The ring is unfolded by laying the triangles' rest shapes edge to edge, so seams and folded garments are no special
-    case, and axes are those of the vertex's first triangle.
+    case. Axes are those of the vertex's first triangle.
     """
     beyond = _triangles_beyond(mesh)
     spokes = _spokes(mesh, beyond)
-    rows = [_fit(patch) for patch in (_determined(v, spokes[v], beyond) for v in range(len(mesh.vertices)))]
+    rows = [_fit(patch) for patch in (_determining_ring(v, spokes[v], beyond) for v in range(len(mesh.vertices)))]
     depth = max(len(near) for near, _ in rows)
     stencil = np.repeat(np.arange(len(rows))[:, None], depth, axis=1)
     weight = np.zeros((len(rows), depth, 5))
@@ -45,7 +52,7 @@ def curvature_stencils(mesh: Mesh) -> CurvatureStencils:
 
 
 def mixed_area(mesh: Mesh) -> np.ndarray:
-    """[V] m^2, Voronoi area of each vertex, safe for obtuse triangles (Meyer et al. 2003).
+    """Compute the mixed Voronoi area of each vertex, [V] m^2, safe for obtuse triangles (Meyer et al. 2003).
 
     Thirds of the triangles would make the curvature energy depend on each vertex's valence.
     """
@@ -63,14 +70,19 @@ def mixed_area(mesh: Mesh) -> np.ndarray:
 
 
 class SparsityPattern(NamedTuple):
-    """Where a matrix that couples the vertices of each stencil is not zero, by rows."""
+    """Non-zero entries of a matrix that couples the vertices of each stencil, by rows.
 
-    columns: np.ndarray  # [V, D] int, padded with the row itself
-    slots: np.ndarray  # [V, N + 1, N + 1] int, place of each stencil's local entry in the flat columns; V D for none
+    Attributes:
+        columns: [V, D] int, padded with the row itself.
+        slots: [V, N + 1, N + 1] int, position of each stencil's local entry in the flat columns; V D for none.
+    """
+
+    columns: np.ndarray
+    slots: np.ndarray
 
 
 def find_sparsity_pattern(near: np.ndarray, local: np.ndarray) -> SparsityPattern:
-    """Entries that are not negligible where local matrices [V, N + 1, N + 1] (the vertex first) are summed.
+    """Find the entries that are not negligible in the sum of local matrices [V, N + 1, N + 1], the vertex first.
 
     The diagonal is left out: rows sum to zero, so (Q f)_i = sum_d entry_id (f_d - f_i).
     """
@@ -80,24 +92,27 @@ def find_sparsity_pattern(near: np.ndarray, local: np.ndarray) -> SparsityPatter
     key, inverse = np.unique(key, return_inverse=True)
     entry = np.bincount(inverse.ravel(), weights=local.ravel())
     row, column = key // count, key % count
-    kept = (row != column) & (np.abs(entry) > 1e-12 * np.abs(entry).max())
-    length = np.bincount(row[kept], minlength=count)
-    place = np.arange(kept.sum()) - np.repeat(np.cumsum(length) - length, length)
+    is_entry = (row != column) & (np.abs(entry) > 1e-12 * np.abs(entry).max())
+    length = np.bincount(row[is_entry], minlength=count)
+    place = np.arange(is_entry.sum()) - np.repeat(np.cumsum(length) - length, length)
     columns = np.repeat(np.arange(count)[:, None], max(1, length.max(initial=0)), axis=1)
-    columns[row[kept], place] = column[kept]
+    columns[row[is_entry], place] = column[is_entry]
     slot = np.full(len(key), columns.size)
-    slot[kept] = row[kept] * columns.shape[1] + place
+    slot[is_entry] = row[is_entry] * columns.shape[1] + place
     return SparsityPattern(columns, slot[inverse.ravel()].reshape(local.shape))
 
 
 def sum_entries(shape: SparsityPattern, local: np.ndarray) -> np.ndarray:
-    """Off-diagonal entries [V, D] of the sum of the local matrices."""
+    """Sum the local matrices, and return the off-diagonal entries [V, D]."""
     flat = np.bincount(shape.slots.ravel(), weights=local.ravel(), minlength=shape.columns.size + 1)
     return flat[:-1].reshape(shape.columns.shape)
 
 
 def local_matrices(form: np.ndarray, other: np.ndarray | None = None) -> np.ndarray:
-    """[V, N + 1, N + 1] of sum_c (sum_n form_nc (f_n - f_v)) (sum_n other_nc (f_n - f_v)), from forms [V, N, C]."""
+    """Return the matrices [V, N + 1, N + 1] of products of linear forms [V, N, C].
+
+    They represent sum_c (sum_n form_nc (f_n - f_v)) (sum_n other_nc (f_n - f_v)); ``other`` defaults to ``form``.
+    """
     full, second = (
         np.concatenate([-part.sum(1, keepdims=True), part], axis=1) for part in (form, form if other is None else other)
     )
@@ -105,7 +120,10 @@ def local_matrices(form: np.ndarray, other: np.ndarray | None = None) -> np.ndar
 
 
 def largest_eigenvalue(columns: np.ndarray, entries: np.ndarray, mass: np.ndarray, steps: int = 300) -> float:
-    """Of Q f = lambda mass f, bounded above: power iteration, whose expected error is below 1 ln V / steps, and 5 %."""
+    """Bound the largest eigenvalue of Q f = lambda mass f from above.
+
+    By power iteration, whose expected relative error is below ln V / steps, plus 5 %.
+    """
     root = 1 / np.sqrt(mass)
     diagonal = -entries.sum(1)
     f = np.random.default_rng(0).standard_normal(len(mass))
@@ -121,7 +139,7 @@ def largest_eigenvalue(columns: np.ndarray, entries: np.ndarray, mass: np.ndarra
 
 
 def _triangles_beyond(mesh: Mesh) -> dict[tuple[int, int], tuple[int, complex]]:
-    """By directed edge (p, q) of a triangle: its third vertex r, and (r - p) / (q - p) in the rest plane.
+    """Return by directed edge (p, q) of a triangle its third vertex r, and (r - p) / (q - p) in the rest plane.
 
     Complex numbers are points of the plane: multiplying by the ratio lays the triangle against a given edge.
     """
@@ -141,7 +159,7 @@ def _triangles_beyond(mesh: Mesh) -> dict[tuple[int, int], tuple[int, complex]]:
 
 
 def _spokes(mesh: Mesh, beyond) -> list[dict[int, complex]]:
-    """Per vertex: its edges that start a triangle, as seen from it in that triangle's material axes."""
+    """Return for each vertex its edges that start a triangle, in that triangle's material axes."""
     rest = mesh.rest[..., 0] + 1j * mesh.rest[..., 1]
     out: list[dict[int, complex]] = [{} for _ in mesh.vertices]
     for k in range(3):
@@ -152,7 +170,7 @@ def _spokes(mesh: Mesh, beyond) -> list[dict[int, complex]]:
 
 
 def _ring(v: int, spokes: dict[int, complex], beyond) -> dict[int, complex]:
-    """The neighbours of ``v`` in order, unfolded about it; the angles of a closed ring that is not flat are scaled."""
+    """Return the neighbours of ``v`` in order, unfolded about it; angles of a closed ring are scaled to be flat."""
     rims = [a for a in spokes if (a, v) not in beyond]
     fans = [_fan(v, start, beyond) for start in rims or [next(iter(spokes))]]
     ring, ratios, closed = max(fans, key=lambda fan: len(fan[0]))  # one of those that only touch at the vertex
@@ -164,7 +182,7 @@ def _ring(v: int, spokes: dict[int, complex], beyond) -> dict[int, complex]:
 
 
 def _fan(v: int, start: int, beyond) -> tuple[list[int], list[complex], bool]:
-    """Neighbours counter-clockwise from ``start``, the ratios between them, and whether they come round."""
+    """Return neighbours counter-clockwise from ``start``, the ratios between them, and whether they close a ring."""
     ring, ratios = [start], []
     while (v, ring[-1]) in beyond:
         after, ratio = beyond[v, ring[-1]]
@@ -175,8 +193,8 @@ def _fan(v: int, start: int, beyond) -> tuple[list[int], list[complex], bool]:
     return ring, ratios, False
 
 
-def _determined(v: int, spokes: dict[int, complex], beyond) -> dict[int, complex]:
-    """Unfolded neighbours of ``v``, enough for a quadratic if the mesh has them."""
+def _determining_ring(v: int, spokes: dict[int, complex], beyond) -> dict[int, complex]:
+    """Return unfolded neighbours of ``v``, enough for a quadratic if the mesh has them."""
     place = _ring(v, spokes, beyond)
     edges = [(a, beyond[v, a][0]) for a in place if (v, a) in beyond]
     for _ in range(MAX_RING_GROWTHS):
@@ -223,18 +241,20 @@ def _split(z: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarra
 
 
 def _fit(patch: dict[int, complex]) -> tuple[list[int], np.ndarray]:
-    """Neighbours and their weights [N, 5]: second derivatives, first derivatives."""
+    """Return neighbours and their weights [N, 5]: of the second derivatives, then of the first."""
     root, slope, quadratic, project, length = _split(np.array(list(patch.values())))
     left, singular, right = np.linalg.svd(project @ quadratic, full_matrices=False)
-    kept = singular > MIN_SINGULAR_VALUE_RATIO / 20 * len(patch) ** 0.5  # before the linear part went, every row had length 1/2
-    inverse = np.where(kept, 1 / np.where(kept, singular, 1.0), 0.0)
+    is_determined = (
+        singular > MIN_SINGULAR_VALUE_RATIO / 20 * len(patch) ** 0.5
+    )  # before the linear part went, every row had length 1/2
+    inverse = np.where(is_determined, 1 / np.where(is_determined, singular, 1.0), 0.0)
     second = (right.T * inverse) @ left.T @ project
     first = slope @ root @ (np.eye(len(patch)) - quadratic @ second)
     return list(patch), np.concatenate([second / length**2, first / length]).T
 
 
 def _cotangents(mesh: Mesh) -> np.ndarray:
-    """[F, 3] cotangent of the rest angle at each corner."""
+    """Return the cotangents of the rest angles at the corners, [F, 3]."""
     out = np.zeros((len(mesh.faces), 3))
     for corner in range(3):
         a = mesh.rest[:, (corner + 1) % 3] - mesh.rest[:, corner]

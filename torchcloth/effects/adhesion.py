@@ -1,4 +1,4 @@
-"""Cloth that sticks to a table."""
+"""Adhesion: a plane that pulls cloth near it, such as a table."""
 
 from __future__ import annotations
 
@@ -16,25 +16,25 @@ from ..parameters import PhysicalParameter
 from ..types import EffectInputs
 from .base import AbstractEffect, Amplitude
 
-MAX_PULL_SLOPE = 8 / 3 / 3**0.5  # largest slope of (1 - u^2)^2, at u = 3^-1/2
+MAX_PULL_SLOPE = 8 / 3 / 3**0.5  # dimensionless, of (1 - u^2)^2, at u = 3^-1/2
 
 
 class Adhesion(AbstractEffect):
-    """Pull of a plane on cloth near it: a charge, moisture, or fibres that catch.
+    """Pull of a plane on cloth near it, by charge, moisture or fibres that catch.
 
-        t = -stress (1 - (d / gap)^2)^2 n,  0 < d < gap; the whole stress at d <= 0
+        t = -stress (1 - (d / gap)^2)^2 n,  0 < d < gap; the full stress at d <= 0
 
-    per area at rest, d the height over the plane. It resists being lifted, and adds to the push on the plane, so that
-    friction grows (Derjaguin, Muller and Toporov 1975: mu (N + stress A)). Charges of 5e-6 C/m^2 make 1.4 Pa, the
-    weight of a light cloth; wet cloth has 100 to 1000 Pa. Lifting costs 8/15 stress gap per area. A collider's
-    ``offset`` counts as height: cloth that is kept half a gap above the plane feels 56 % of the stress, at a whole gap
+    per area at rest, with d the height over the plane. Adhesion resists lifting, and adds to the pressure on the plane,
+    so that friction grows (Derjaguin, Muller and Toporov 1975: mu (N + stress A)). Charges of 5e-6 C/m^2 make 1.4 Pa,
+    the weight of a light cloth; wet cloth has 100 to 1000 Pa. Lifting costs the energy 8/15 stress gap per area. A
+    collider's ``offset`` counts as height: half a gap above the plane cloth feels 56 % of the stress, at a whole gap
     none.
 
     Args:
-        stress: [Pa], >= 0: a number, or [B, 1] for a batch.
-        gap: reach of the pull [m].
+        stress: adhesive stress [Pa], >= 0; a scalar, or [B, 1] for a batch.
+        gap: range of the pull [m].
         point: [3] m, any point of the plane, such as a ``Plane``'s.
-        normal: [3], to the free side; normalised here.
+        normal: [3], towards the free side; normalised here.
 
     Raises:
         InvalidInput: negative stress, a gap that is not positive, a zero normal.
@@ -63,25 +63,25 @@ class Adhesion(AbstractEffect):
         self.area: Tensor  # [V, 1] m^2, at rest
 
     def bind(self, mesh: Mesh) -> Adhesion:
-        """Every vertex stands for its share of the triangles around it."""
+        """Resolve the area of each vertex, a third of its triangles, and return self."""
         area = np.asarray(mesh.vertex_area)
         self.area = torch.as_tensor(area, dtype=self.normal.dtype, device=self.normal.device).unsqueeze(-1)
         return self
 
     def coefficients(self) -> Tensor:
-        """[..., 1, 1] Pa."""
+        """Return the stress, [..., 1, 1] Pa."""
         return self.stress.field
 
-    def force(self, c: Tensor, now: EffectInputs) -> Tensor:
-        """Force on each vertex."""
-        height = (now.x - self.point) @ self.normal.unsqueeze(-1)
+    def force(self, c: Tensor, inputs: EffectInputs) -> Tensor:
+        """Return the pull on each vertex."""
+        height = (inputs.x - self.point) @ self.normal.unsqueeze(-1)
         u = (height / self.gap).clamp(0.0, 1.0)
         return -(c * self.area * (1 - u * u) ** 2) * self.normal
 
     def stability_bounds(self, c: Tensor, mass: Tensor) -> tuple[Tensor, Tensor]:
-        """The steepest slope of the pull bounds omega^2."""
+        """Bound omega^2 by the steepest slope of the pull."""
         return MAX_PULL_SLOPE / self.gap * (c * self.area / mass).amax(), mass.new_zeros(())
 
     def extra_repr(self) -> str:
-        """One line of the data sheet."""
+        """Return the line of the data sheet: gap and plane."""
         return f"gap={self.gap:g} m, point={self.point.tolist()} m, normal={self.normal.tolist()}"

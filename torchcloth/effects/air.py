@@ -1,4 +1,4 @@
-"""Air that resists motion."""
+"""Air drag: quadratic resistance against motion through the air."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+from .._utils.constants import STANDARD_AIR_DENSITY_KG_PER_M3
 from .._utils.linalg import dot, safe_norm
 from .._utils.vectors import parse_finite_numbers
 from ..errors import InvalidInput
@@ -20,11 +21,17 @@ from .base import AbstractEffect, Amplitude
 
 
 class Coefficients(NamedTuple):
-    """Half the air's density times the drag coefficients [kg/m^3], [..., 1 or E, 1], and the air's velocity."""
+    """What the drag force needs.
+
+    Attributes:
+        pressure: [..., 1 or E, 1] kg/m^3, half the air's density times C_n.
+        friction: [..., 1 or E, 1] kg/m^3, half the air's density times C_t.
+        wind: [..., 1, 3] m/s, velocity of the air.
+    """
 
     pressure: Tensor
     friction: Tensor
-    wind: Tensor  # [..., 1, 3] m/s
+    wind: Tensor
 
 
 class AirDrag(AbstractEffect):
@@ -32,12 +39,12 @@ class AirDrag(AbstractEffect):
 
     ``a`` is the triangle's current area, u = v - wind the velocity of its centroid relative to the air, u_n its normal
     component and u_t its tangential vector. C_t counts both sides of the sheet. The wind is uniform and steady; gusts
-    and the sheet's own wake are not modelled. A wind without drag coefficients does nothing, and has no gradient there.
-    The stable step knows the wind and not the sheet's own speed: in air that suffices, in water it does not.
+    and the sheet's own wake are not modelled. Without drag coefficients a wind does nothing and has no gradient. The
+    stable step accounts for the wind but not for the sheet's own speed: in air that suffices, in water it does not.
 
     Args:
         normal: drag coefficient C_n >= 0; a flat plate has about 1.2.
-        density: of the air [kg/m^3], a constant.
+        density: density of the air [kg/m^3], a constant.
         tangential: friction coefficient C_t >= 0 of both sides together; laminar flow at Re 3e4 has about 0.016.
         wind: [3] m/s, velocity of the air in world axes. Learnable.
 
@@ -56,7 +63,7 @@ class AirDrag(AbstractEffect):
     def __init__(
         self,
         normal: float | Tensor = 1.2,
-        density: float = 1.204,
+        density: float = STANDARD_AIR_DENSITY_KG_PER_M3,
         tangential: float | Tensor = 0.0,
         wind: Sequence[float] = (0.0, 0.0, 0.0),
     ) -> None:
@@ -67,27 +74,27 @@ class AirDrag(AbstractEffect):
         self.tangential = PhysicalParameter(tangential, "-", "nonnegative", name="tangential air drag coefficient")
         self.wind = nn.Parameter(parse_finite_numbers("wind", wind, 3, "three finite numbers in m/s").clone())
         self.density = float(density)
-        self.register_buffer("share", torch.zeros(0, 1), persistent=False)
-        self.register_buffer("rim", torch.zeros(0, 1), persistent=False)
-        self.share: Tensor  # [V, 1] m^2, a third of each vertex's triangles
-        self.rim: Tensor  # [V, 1] m, half the perimeters of each vertex's triangles
+        self.register_buffer("vertex_area", torch.zeros(0, 1), persistent=False)
+        self.register_buffer("half_perimeter", torch.zeros(0, 1), persistent=False)
+        self.vertex_area: Tensor  # [V, 1] m^2, a third of each vertex's triangles
+        self.half_perimeter: Tensor  # [V, 1] m, half the perimeters of each vertex's triangles
 
     def bind(self, mesh: Mesh) -> AirDrag:
-        """Sizes of the triangles, for the bounds on what a wind does."""
+        """Resolve the sizes of the triangles, for the bounds on the wind's effect, and return self."""
         perimeter = np.linalg.norm(np.roll(mesh.rest, -1, axis=1) - mesh.rest, axis=-1).sum(1)
         sizes = (mesh.vertex_area, np.bincount(mesh.faces.ravel(), np.repeat(perimeter / 2, 3)))
         like = {"dtype": torch.get_default_dtype(), "device": self.wind.device}
-        self.share, self.rim = (torch.as_tensor(size, **like).unsqueeze(-1) for size in sizes)
+        self.vertex_area, self.half_perimeter = (torch.as_tensor(size, **like).unsqueeze(-1) for size in sizes)
         return self
 
     def coefficients(self) -> Coefficients:
-        """Dynamic pressures per squared velocity, and the wind."""
+        """Return dynamic pressures per squared velocity, and the wind."""
         half = 0.5 * self.density
         return Coefficients(half * self.normal.field, half * self.tangential.field, self.wind.unsqueeze(-2))
 
-    def force(self, c: Coefficients, now: EffectInputs) -> Tensor:
-        """Drag on each triangle."""
-        surface = now.surface
+    def force(self, c: Coefficients, inputs: EffectInputs) -> Tensor:
+        """Return the drag on each triangle."""
+        surface = inputs.surface
         relative = surface.v - c.wind
         speed = dot(relative, surface.n)
         along = relative - speed * surface.n
@@ -95,16 +102,17 @@ class AirDrag(AbstractEffect):
         return -(c.pressure * area * speed.abs() * speed) * surface.n - (c.friction * area * safe_norm(along)) * along
 
     def stability_bounds(self, c: Coefficients, mass: Tensor) -> tuple[Tensor, Tensor]:
-        """Of a sheet at rest in the wind (row sums): drag is linear about it, and its pressure turns with the sheet.
+        """Bound the spectrum of a sheet at rest in the wind, by row sums.
 
-        With f(u, N) for the area vector N: |df/du| <= 2 max(P, Q) |u| a, |df/dN| <= 3 (P + Q) |u|^2, and a corner moves
-        N by half the edge that faces it. Both are 0 in still air.
+        Drag is linear about that state, and its pressure turns with the sheet. With f(u, N) for the area vector N:
+        |df/du| <= 2 max(P, Q) |u| a, |df/dN| <= 3 (P + Q) |u|^2, and a corner moves N by half of the opposite edge.
+        Both are 0 in still air.
         """
         wind, normal, along = safe_norm(c.wind).amax(), c.pressure.amax(), c.friction.amax()
-        turning = (normal + along) * wind * wind * (self.rim / mass).amax()
-        return turning, 2 * torch.maximum(normal, along) * wind * (self.share / mass).amax()
+        turning = (normal + along) * wind * wind * (self.half_perimeter / mass).amax()
+        return turning, 2 * torch.maximum(normal, along) * wind * (self.vertex_area / mass).amax()
 
     def extra_repr(self) -> str:
-        """One line of the data sheet."""
+        """Return the line of the data sheet: density and wind."""
         wind = [round(value, 6) for value in self.wind.flatten().tolist()]
         return f"density={self.density:g} kg/m^3" + (f", wind={wind} m/s" if any(wind) else "")

@@ -1,4 +1,4 @@
-"""What an effect must answer."""
+"""Base class of effects: the hooks that an effect may override."""
 
 from __future__ import annotations
 
@@ -15,19 +15,26 @@ from ..types import EffectInputs, Surface
 
 
 class Amplitude(NamedTuple):
-    """How large a parameter of an effect is; 0 switches that part of the effect off."""
+    """Scale of an effect's parameter. At 0 that part of the effect is switched off.
+
+    Attributes:
+        unit: SI unit.
+        typical: value in an ordinary case.
+        smallest: smallest effect of interest.
+        equivalences: effects or parameters that data can hardly distinguish from this one.
+    """
 
     unit: str
-    typical: float  # of an ordinary case
-    smallest: float  # below this nobody cares
-    equivalences: tuple[str, ...] = ()  # effects or parameters that data can hardly tell from it
+    typical: float
+    smallest: float
+    equivalences: tuple[str, ...] = ()
 
 
 class AbstractEffect(nn.Module, ABC):
-    """Something real that the bare membrane does not have. Amplitude 0 must leave the base model bitwise unchanged.
+    """A physical effect that the bare membrane does not have. Amplitude 0 must leave the base model bitwise unchanged.
 
-    An effect may be a force, and may also add mass, air that moves along, another rest shape, or slip in a gripper:
-    override what it is. Everything else answers None and costs nothing. A constant force per vertex:
+    An effect may be a force; it may also add mass, added mass of air, another rest shape, or slip in a gripper.
+    Override the hooks that it needs: all others return None and cost nothing. A constant force per vertex:
 
         class Pull(AbstractEffect):
             amplitudes = {"strength": Amplitude("N", 1e-3, 1e-4)}
@@ -35,24 +42,26 @@ class AbstractEffect(nn.Module, ABC):
             def __init__(self, strength=1e-3):
                 super().__init__()
                 self.strength = PhysicalParameter(strength, "N", "nonnegative", name="pull")  # 0 must be allowed
-                self.register_buffer("along", torch.tensor([1.0, 0.0, 0.0]))  # goes where the cloth goes
+                self.register_buffer("along", torch.tensor([1.0, 0.0, 0.0]))  # a buffer moves to the cloth's device
 
             def coefficients(self):
-                return self.strength.field  # [..., 1, 1]: numbers, fields and batches alike
+                return self.strength.field  # [..., 1, 1], for scalars, fields and batches
 
-            def force(self, c, now):
-                return c * self.along.expand_as(now.x)
+            def force(self, c, inputs):
+                return c * self.along.expand_as(inputs.x)
 
         class TestPull(torchcloth.testing.EffectContract):
             def make(self, amplitude):
                 return Pull(amplitude)
 
-    Class attributes:
-        amplitudes: by parameter name, the main one first.
-        per_triangle: names of parameters that may have a value for each triangle, all others being scalars or batches
-            of them; None: not said, so not checked.
+    In all hooks ``c`` is what ``coefficients`` returned.
+
+    Attributes:
+        amplitudes: scales by parameter name, the main parameter first.
+        per_triangle: names of the parameters that may have one value per triangle; all others are scalars or batches of
+            scalars. None: not declared, so not checked.
         acts_on: whether ``force`` returns one row per vertex, or one per triangle (shared equally by its corners).
-        grasp: name of the boundary that ``grip_velocities`` belongs to.
+        grasp: name of the boundary whose grip ``grip_velocities`` changes; None: of none.
     """
 
     amplitudes: ClassVar[Mapping[str, Amplitude]]
@@ -62,43 +71,49 @@ class AbstractEffect(nn.Module, ABC):
 
     @property
     def has_axes(self) -> bool:
-        """Whether warp and weft differ: then the mesh must have a pattern."""
+        """Whether the effect distinguishes warp and weft, so that the mesh must have a pattern."""
         return False
 
     def bind(self, mesh: Mesh) -> AbstractEffect:
-        """Resolve what depends on the mesh; returns self."""
+        """Resolve what depends on the mesh, and return self."""
         return self
 
     @abstractmethod
     def coefficients(self) -> Any:
-        """What the methods below need of the learnable parameters; called once per rollout."""
+        """Return what the hooks need of the learnable parameters; called once per rollout."""
 
-    def force(self, c: Any, now: EffectInputs) -> Tensor | None:
-        """[..., V, 3] or [..., E, 3] N (see ``acts_on``)."""
+    def force(self, c: Any, inputs: EffectInputs) -> Tensor | None:
+        """Return the force in N, [..., V, 3] or [..., E, 3] (see ``acts_on``); None: no force."""
         return None
 
-    def viscous(self, c: Any, now: EffectInputs) -> Tensor | None:
-        """[..., V, 3] N: the part of ``force`` that is linear in velocity, if it may be stiff; then it costs no steps.
+    def viscous(self, c: Any, inputs: EffectInputs) -> Tensor | None:
+        """Return the part of ``force`` that is linear in velocity and may be stiff, [..., V, 3] N; None: no such part.
 
-        At fixed positions it is -C v with C symmetric and not negative. ``viscous_stability_bound`` must be there as well, and
-        ``force`` one of the vertices.
+        It acts in stages, so it does not shorten the substep. At fixed positions it must be -C v with C symmetric and
+        not negative. ``viscous_stability_bound`` must be overridden too, and ``acts_on`` must be "vertices".
         """
         return None
 
     def mass(self, c: Any) -> Tensor | None:
-        """[..., V, 1] kg, carried along by the vertices."""
+        """Return mass that the vertices carry along, [..., V, 1] kg; None: no mass."""
         return None
 
     def inertia(self, c: Any, surface: Surface) -> Tensor | None:
-        """[..., E, 1] kg that a triangle must move along its normal only."""
+        """Return added mass that a triangle moves along its normal only, [..., E, 1] kg; None: no added mass."""
         return None
 
     def rest_deformation(self, c: Any) -> Tensor | None:
-        """[..., E or 1, 2, 2], columns: where the warp and weft of the pattern lie in the true rest shape."""
+        """Return the rest deformation [..., E or 1, 2, 2]; None: the pattern is the rest shape.
+
+        Its columns are the pattern's warp and weft in the true rest shape.
+        """
         return None
 
     def grip_compliance(self, c: Any) -> float:
-        """m/(N s): most speed that ``grip_velocities`` gives for a force; viscous forces on what yields much take no stages."""
+        """Return the largest speed that ``grip_velocities`` gives per force [m/(N s)].
+
+        Viscous forces on vertices that yield much are not applied in stages.
+        """
         return 0.0 if self.grasp is None else math.inf
 
     def grip_velocities(
@@ -111,38 +126,50 @@ class AbstractEffect(nn.Module, ABC):
         dt: float,
         added_mass_ratio: Tensor | None,
     ) -> Tensor:
-        """Velocities of the held vertices ``index`` in an imperfect grip, from those ``free`` of it and ``held`` by it.
+        """Return the velocities of vertices in an imperfect grip, [..., V, 3] m/s.
 
-        All of ``free``, ``held`` and the result are [..., V, 3] m/s. ``resistance`` [..., V, 3, 3] is the mass of the
-        air that moves along, over the ``mass`` [..., V, 1] kg of the vertices; None: none does.
+        Args:
+            c: coefficients.
+            index: [H], the gripped vertices.
+            free: [..., V, 3] m/s, velocities without the grip.
+            gripped: [..., V, 3] m/s, velocities in a perfect grip.
+            mass: [..., V, 1] kg, vertex masses.
+            dt: length of the substep [s].
+            added_mass_ratio: [..., V, 3, 3], mass of the air that moves along over the vertices' own; None: no air.
         """
         return gripped
 
     def initial_memory(self, x: Tensor) -> Tensor | None:
-        """Internal variables [..., N, K] of a virgin cloth at positions [..., V, 3]; None: remembers nothing."""
+        """Return internal variables [..., N, K] of a new cloth at positions [..., V, 3]; None: the effect has none."""
         return None
 
-    def update_memory(self, c: Any, now: EffectInputs) -> Tensor:
-        """Internal variables at ``now``, from those of the substep before (``now.memory``); called before ``force``."""
-        raise NotImplementedError(f"{type(self).__name__} starts internal variables but does not update_memory them")
+    def update_memory(self, c: Any, inputs: EffectInputs) -> Tensor:
+        """Return the internal variables at the present state, from the earlier ones ``inputs.memory``.
+
+        It is called before ``force``.
+        """
+        raise NotImplementedError(f"{type(self).__name__} has initial_memory, but does not override update_memory")
 
     def stability_bounds(self, c: Any, mass: Tensor) -> tuple[Tensor, Tensor]:
-        """(bound on omega^2 [1/s^2], bound on the linear damping rate [1/s]) that this effect adds; limits the step."""
+        """Return bounds on omega^2 [1/s^2] and on the linear damping rate [1/s] that the effect adds.
+
+        They limit the substep. ``mass`` is [..., V, 1] kg.
+        """
         return mass.new_zeros(()), mass.new_zeros(())
 
     def viscous_stability_bound(self, c: Any, mass: Tensor) -> Tensor:
-        """What of that damping rate [1/s] is ``viscous``."""
+        """Return the part of that damping rate [1/s] which is ``viscous``."""
         return mass.new_zeros(())
 
 
-def require_memory(now: EffectInputs) -> Tensor:
-    """The internal variables, for an effect that cannot do without.
+def require_memory(inputs: EffectInputs) -> Tensor:
+    """Return the internal variables of an effect that needs them.
 
     Raises:
-        InvalidInput: the state carries none.
+        InvalidInput: the state has none.
     """
-    if now.memory is None:
+    if inputs.memory is None:
         raise InvalidInput(
             "memory of an effect", got="none", expected="internal variables", remedy="take the state from Cloth.state"
         )
-    return now.memory
+    return inputs.memory

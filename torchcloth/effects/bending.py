@@ -14,21 +14,37 @@ from ..errors import InvalidInput
 from ..meshes import Mesh
 from ..parameters import PhysicalParameter
 from ..types import EffectInputs
-from ._bent import BendingStencil, neighbour_differences
-from ._curvature import curvature_stencils, sum_entries, largest_eigenvalue, local_matrices, mixed_area, find_sparsity_pattern
-from ._plate import PlateOperator, Plate
+from ._bending_stencil import BendingStencil, neighbour_differences
+from ._curvature import (
+    curvature_stencils,
+    find_sparsity_pattern,
+    largest_eigenvalue,
+    local_matrices,
+    mixed_area,
+    sum_entries,
+)
+from ._plate import Plate, PlateOperator
 from .base import AbstractEffect, Amplitude
 
 
 class Coefficients(NamedTuple):
-    """What the force needs; the optional ones where the sheet is not isotropic and uniform, or not flat at rest."""
+    """What the bending force needs.
 
-    stiffness: Tensor  # [] or [..., 1, 1] N m, or 1 where ``operator`` holds it
-    viscosity: Tensor  # the same times the damping time, N m s or s
-    operator: Tensor | None = None  # [..., D V, 1] N/m
+    Attributes:
+        stiffness: [] or [..., 1, 1] N m; or 1 where ``operator`` contains the stiffness.
+        viscosity: stiffness times damping time [N m s], or the damping time [s].
+        operator: [..., D V, 1] N/m, for a sheet that is not isotropic and uniform; else None.
+        plate: stiffness matrix, for such a sheet or one that is not flat at rest; else None.
+        curl: [..., 1, 3] 1/m, rest curvature along ww, ff, sqrt 2 wf; None: flat.
+        mobility: [..., 1, 1] 1/s, of creases; None: no creases.
+    """
+
+    stiffness: Tensor
+    viscosity: Tensor
+    operator: Tensor | None = None
     plate: Plate | None = None
-    curl: Tensor | None = None  # [..., 1, 3] 1/m, rest curvature along ww, ff, sqrt 2 wf
-    mobility: Tensor | None = None  # [..., 1, 1] 1/s, of creases
+    curl: Tensor | None = None
+    mobility: Tensor | None = None
 
 
 class Bending(AbstractEffect):
@@ -45,7 +61,7 @@ class Bending(AbstractEffect):
     sqrt(B_warp B_weft) twist_ratio (1: Huber's estimate). A narrow strip at an angle a to the warp then has, at
     nu = 0, 1/B = cos^4 a / B_warp + sin^4 a / B_weft + 2 cos^2 a sin^2 a / B_twist.
 
-    What is None is not there: no parameter to learn, no cost. 0 is there to be learned.
+    An argument that is None adds no parameter and no cost. An argument of 0 adds a parameter that can be learned.
 
     Args:
         stiffness: B, along the warp where it differs [N m], >= 0; fabrics have 1e-6 to 1e-4. A number, one value per
@@ -93,14 +109,14 @@ class Bending(AbstractEffect):
         self.curl_weft = _optional(curl_weft, "1/m", "real", "curl_weft")
         for name, like in (("columns", torch.long), ("operator", None), ("bound", None), ("faces", torch.long)):
             self.register_buffer(name, torch.zeros(0, dtype=like), persistent=False)
-        self.columns: Tensor  # [D, V] vertices that a vertex's force depends on
-        self.operator: Tensor  # [D, V, 1] 1/m^2: minus the off-diagonal entries of Q for B = 1
-        self.bound: Tensor  # [V, 1] 1/m^2: each vertex's area times the largest eigenvalue of Q over the areas
+        self.columns: Tensor  # [D, V], vertices that a vertex's force depends on
+        self.operator: Tensor  # [D, V, 1] 1/m^2, minus the off-diagonal entries of Q for B = 1
+        self.bound: Tensor  # [V, 1] 1/m^2, each vertex's area times the largest eigenvalue of Q over the areas
         self.faces: Tensor  # [E, 3]
         self.stencil, self.plate_operator = BendingStencil(), PlateOperator()
 
     def bind(self, mesh: Mesh) -> Bending:
-        """Build the curvature stencils of the mesh's vertices and the matrix Q.
+        """Build the curvature stencils of the mesh's vertices and the matrix Q, and return self.
 
         Raises:
             InvalidInput: a field that does not have one value per triangle.
@@ -110,26 +126,26 @@ class Bending(AbstractEffect):
             got, want = f"shape {tuple(self.stiffness.raw.shape)}", f"a number, [{len(mesh.faces)}] or [B, 1]"
             raise InvalidInput("bending stiffness", got=got, expected=want)
         dtype, device = torch.get_default_dtype(), self.stiffness.raw.device
-        plate = _plate(mesh, self.poisson)
+        plate = _uniform_plate(mesh, self.poisson)
         self.columns = torch.as_tensor(plate.columns.T.copy(), device=device)
         self.operator = torch.as_tensor(-plate.entries.T.copy(), dtype=dtype, device=device).unsqueeze(-1)
         self.bound = torch.as_tensor(plate.bound.copy(), dtype=dtype, device=device).unsqueeze(-1)
         self.faces = torch.as_tensor(mesh.faces.copy(), device=device)
         self.stencil.bind(mesh, device)
-        if self._uneven(size):
+        if self._needs_operator(size):
             self.plate_operator.bind(curvature_stencils(mesh), mixed_area(mesh), device)
         return self
 
-    def _uneven(self, size: int) -> bool:
+    def _needs_operator(self, size: int) -> bool:
         return size > 1 or self.weft_ratio is not None or self.twist_ratio is not None
 
     @property
     def has_axes(self) -> bool:
-        """Of woven cloth and curls."""
+        """Whether the effect distinguishes warp and weft: for woven cloth and for curls."""
         return any(p is not None for p in (self.weft_ratio, self.twist_ratio, self.curl_warp, self.curl_weft))
 
     def coefficients(self) -> Coefficients:
-        """Resolved once per rollout.
+        """Return what the force needs; see ``Coefficients``.
 
         Raises:
             InvalidInput: a value for each triangle, given to an effect that was made with one for all.
@@ -137,7 +153,7 @@ class Bending(AbstractEffect):
         field = self.stiffness.field
         time = None if self.damping_time is None else self.damping_time.field
         curl = self._curl(field)
-        if not self._uneven(field.shape[-2]):
+        if not self._needs_operator(field.shape[-2]):
             viscosity = torch.zeros_like(field) if time is None else field * time
             plate = None if curl is None else self._plate(field)
             return Coefficients(field, viscosity, None, plate, curl)
@@ -153,7 +169,7 @@ class Bending(AbstractEffect):
         return Coefficients(torch.ones_like(time), time, self.plate_operator.entries(plate), plate, curl)
 
     def has_rest_curvature(self) -> bool:
-        """Whether the sheet may be other than flat at rest."""
+        """Return whether the sheet may be curved at rest."""
         return self.curl_warp is not None or self.curl_weft is not None
 
     def _curl(self, like: Tensor) -> Tensor | None:
@@ -171,43 +187,42 @@ class Bending(AbstractEffect):
         return Plate(warp, ratio * warp, self.poisson * mean, (1 - self.poisson) * twist * mean)
 
     def _on_vertices(self, field: Tensor) -> Tensor:
-        """Means [..., V, 1] of values [..., E, 1], by the triangles at each vertex."""
+        """Return the means [..., V, 1] of values [..., E, 1] over the triangles at each vertex."""
         index = self.faces.flatten()
-        spread = field.repeat_interleave(3, dim=-2)
+        repeated = field.repeat_interleave(3, dim=-2)
         count = self.columns.shape[1]
-        total = field.new_zeros(*field.shape[:-2], count, 1).index_add(-2, index, spread)
-        here = field.new_zeros(count, 1).index_add(0, index, field.new_ones(len(index), 1))
-        return total / here
+        total = field.new_zeros(*field.shape[:-2], count, 1).index_add(-2, index, repeated)
+        triangle_count = field.new_zeros(count, 1).index_add(0, index, field.new_ones(len(index), 1))
+        return total / triangle_count
 
-    def force(self, c: Coefficients, now: EffectInputs) -> Tensor:
-        """-Q (x + damping_time v) on each vertex, and what rest curvature adds."""
-        field = c.stiffness * now.x
+    def force(self, c: Coefficients, inputs: EffectInputs) -> Tensor:
+        """Return -Q (x + damping_time v) on each vertex, and what rest curvature adds."""
+        field = c.stiffness * inputs.x
         if self.damping_time is not None:
-            field = field + c.viscosity * now.v
-        force = self._straightened(c, field)
+            field = field + c.viscosity * inputs.v
+        force = self._apply_stiffness(c, field)
         if c.curl is None or c.plate is None:
             return force
         return force - self.stencil.moment_force(
-            self.stencil.fit_surface(now.x, now.compensation), c.plate.moment(self.rest_curvature(c.curl, now))
+            self.stencil.fit_surface(inputs.x, inputs.compensation), c.plate.moment(self.rest_curvature(c.curl, inputs))
         )
 
-    def viscous(self, c: Coefficients, now: EffectInputs) -> Tensor | None:
-        """-Q damping_time v."""
-        return None if self.damping_time is None else self._straightened(c, c.viscosity * now.v)
+    def viscous(self, c: Coefficients, inputs: EffectInputs) -> Tensor | None:
+        """Return -Q damping_time v, if there is damping."""
+        return None if self.damping_time is None else self._apply_stiffness(c, c.viscosity * inputs.v)
 
-    def _straightened(self, c: Coefficients, field: Tensor) -> Tensor:
-        """-Q field."""
+    def _apply_stiffness(self, c: Coefficients, field: Tensor) -> Tensor:
         if c.operator is None:
             return (self.operator * neighbour_differences(field, self.columns)).sum(-3)
         operator = c.operator.unflatten(-2, self.plate_operator.columns.shape)
         return (operator * neighbour_differences(field, self.plate_operator.columns)).sum(-3)
 
-    def rest_curvature(self, curl: Tensor, now: EffectInputs) -> Tensor:
-        """[..., V or 1, 3] 1/m along ww, ff, sqrt 2 wf; ``curl`` is that of the virgin sheet."""
+    def rest_curvature(self, curl: Tensor, inputs: EffectInputs) -> Tensor:
+        """Return the rest curvature [..., V or 1, 3] 1/m along ww, ff, sqrt 2 wf; ``curl`` is that of a new sheet."""
         return curl
 
     def energy(self, c: Coefficients, x: Tensor) -> Tensor:
-        """Bending energy [...] J."""
+        """Compute the bending energy, [...] J."""
         bent = self.stencil.fit_surface(x)
         plate = self._plate(c.stiffness) if c.plate is None else c.plate
         density = plate.energy(bent.second_derivatives)
@@ -216,25 +231,28 @@ class Bending(AbstractEffect):
         return (self.stencil.area * density).sum((-2, -1))
 
     def stability_bounds(self, c: Coefficients, mass: Tensor) -> tuple[Tensor, Tensor]:
-        """B times the largest eigenvalue of Q over the vertices' masses, bounded by that for equal areal density."""
-        stiffness = c.stiffness.amax() * self._spectrum(c, mass)
+        """Bound omega^2 by B times the largest eigenvalue of Q over the vertices' masses.
+
+        The eigenvalue is bounded by that for a uniform areal density.
+        """
+        stiffness = c.stiffness.amax() * self._largest_eigenvalue(c, mass)
         if c.curl is not None and c.plate is not None:
             moment = c.plate.moment(c.curl).square().sum(-1).amax().sqrt()
             stiffness = stiffness + moment * self.stencil.turning_bound_over(mass)
         return stiffness, self.viscous_stability_bound(c, mass)
 
     def viscous_stability_bound(self, c: Coefficients, mass: Tensor) -> Tensor:
-        """All damping there is."""
-        return c.viscosity.amax() * self._spectrum(c, mass)
+        """Return the whole damping rate."""
+        return c.viscosity.amax() * self._largest_eigenvalue(c, mass)
 
-    def _spectrum(self, c: Coefficients, mass: Tensor) -> Tensor:
-        """Largest eigenvalue of Q over the masses, times the stiffness where ``c.operator`` holds it."""
+    def _largest_eigenvalue(self, c: Coefficients, mass: Tensor) -> Tensor:
+        """Return the largest eigenvalue of Q over the masses, times the stiffness where ``c.operator`` contains it."""
         if c.operator is None or c.plate is None:
             return (self.bound / mass).amax()
         return c.plate.eigenvalue_bound() * self.stencil.bending_bound_over(mass)
 
     def extra_repr(self) -> str:
-        """One line of the data sheet."""
+        """Return the line of the data sheet: Poisson's ratio."""
         return f"poisson={self.poisson:g}"
 
 
@@ -242,24 +260,30 @@ def _optional(value: float | Tensor | None, unit: str, domain, name: str) -> Phy
     return None if value is None else PhysicalParameter(value, unit, domain, name=name)
 
 
-class _Even(NamedTuple):
-    """The plate matrix Q of unit stiffness, by rows."""
+class _UniformPlate(NamedTuple):
+    """The plate matrix Q of unit stiffness, by rows.
 
-    columns: np.ndarray  # [V, D] int
-    entries: np.ndarray  # [V, D] 1/m^2, off-diagonal
-    bound: np.ndarray  # [V] 1/m^2: each vertex's area times the largest eigenvalue of Q over the areas
+    Attributes:
+        columns: [V, D] int.
+        entries: [V, D] 1/m^2, off-diagonal.
+        bound: [V] 1/m^2, each vertex's area times the largest eigenvalue of Q over the areas.
+    """
+
+    columns: np.ndarray
+    entries: np.ndarray
+    bound: np.ndarray
 
 
-@lru_cache(maxsize=8)  # as curvature_stencils: the power iteration takes longer than many a simulation
-def _plate(mesh: Mesh, poisson: float) -> _Even:
+@lru_cache(maxsize=8)  # as many as curvature_stencils: the power iteration takes longer than many a simulation
+def _uniform_plate(mesh: Mesh, poisson: float) -> _UniformPlate:
     stencils, area, share = curvature_stencils(mesh), mixed_area(mesh), mesh.vertex_area
-    form = stencils.second @ np.linalg.cholesky(_isotropic(poisson)) * np.sqrt(area)[:, None, None]
+    form = stencils.second @ np.linalg.cholesky(_isotropic_plate(poisson)) * np.sqrt(area)[:, None, None]
     local = local_matrices(form)
     shape = find_sparsity_pattern(stencils.neighbours, local)
     entries = sum_entries(shape, local)
-    return _Even(shape.columns, entries, share * largest_eigenvalue(shape.columns, entries, share))
+    return _UniformPlate(shape.columns, entries, share * largest_eigenvalue(shape.columns, entries, share))
 
 
-def _isotropic(poisson: float) -> np.ndarray:
-    """Energy k . P k / 2 per unit stiffness in k = (k_ww, k_ff, sqrt 2 k_wf)."""
+def _isotropic_plate(poisson: float) -> np.ndarray:
+    """Return P of unit stiffness for k = (k_ww, k_ff, sqrt 2 k_wf)."""
     return np.array([[1.0, poisson, 0.0], [poisson, 1.0, 0.0], [0.0, 0.0, 1.0 - poisson]])

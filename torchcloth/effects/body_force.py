@@ -1,4 +1,4 @@
-"""A force of unknown origin."""
+"""Body force: a given acceleration of every vertex."""
 
 from __future__ import annotations
 
@@ -12,12 +12,13 @@ from .base import AbstractEffect, Amplitude
 
 
 class BodyForce(AbstractEffect):
-    """A given acceleration in world axes, f = m a: what pushes the cloth and has no name.
+    """A given acceleration in world axes, f = m a, for forces of unknown origin.
 
-    ``tc.estimate_pose`` finds the one that a recording needs beside the model; where it is large, the model is wrong.
+    ``tc.estimate_pose`` estimates the one that a recording needs in addition to the model. Where it is large, the model
+    is wrong.
 
     Args:
-        acceleration: [..., V, 3] m/s^2, one for each vertex, or [..., 1, 3], the same everywhere. Learnable.
+        acceleration: [..., V, 3] m/s^2 for each vertex, or [..., 1, 3] for all. Learnable.
 
     Raises:
         InvalidInput: another shape, or a number that is not finite.
@@ -36,16 +37,20 @@ class BodyForce(AbstractEffect):
         )
 
     def bind(self, mesh: Mesh) -> BodyForce:
-        """Check that there is one for each vertex, or one for all."""
+        """Check that there is one acceleration for each vertex or one for all, and return self.
+
+        Raises:
+            InvalidInput: another number of rows.
+        """
         rows, vertices = self.acceleration.raw.shape[-2], len(mesh.vertices)
         if rows not in (1, vertices):
             raise InvalidInput("acceleration", got=f"{rows} rows", expected=f"{vertices}, one per vertex, or 1")
         return self
 
     def coefficients(self) -> Tensor:
-        """[..., V or 1, 3] m/s^2."""
+        """Return the acceleration, [..., V or 1, 3] m/s^2."""
         return self.acceleration.value
 
-    def force(self, c: Tensor, now: EffectInputs) -> Tensor:
-        """m a on each vertex."""
-        return now.mass * c
+    def force(self, c: Tensor, inputs: EffectInputs) -> Tensor:
+        """Return m a on each vertex."""
+        return inputs.mass * c

@@ -1,4 +1,4 @@
-"""Creases that stay."""
+"""Creases: bending that leaves a permanent rest curvature."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ from .bending import Bending, Coefficients
 
 
 class CreasingBending(Bending):
-    """Bending of a sheet that flows where it is bent too far: it keeps creases, in the material.
+    """Bending of a sheet that flows where it is bent beyond a yield curvature, and keeps creases in the material.
 
-    With the elastic curvature e = k - k0 (k along the normal, k0 the rest curvature, curl and creases together) the
-    creases grow as k0' = mobility (|e| - k_y)+ e / |e|: Bingham's law, of which only the excess flows. It is integrated
-    exactly over a substep. Bent to k for a time t, a sheet keeps k0 = (k - k_y) (1 - exp(-mobility t)); below k_y
-    nothing stays. A moment M_y = B k_y belongs to k_y; |e|^2 = e_ww^2 + e_ff^2 + 2 e_wf^2.
+    With the elastic curvature e = k - k0 (k along the normal, k0 the rest curvature of curl and creases together) the
+    creases grow as k0' = mobility (|e| - k_y)+ e / |e|. This is Bingham's law: only the excess over k_y flows. It is
+    integrated exactly over a substep. A sheet that is bent to k for a time t keeps k0 = (k - k_y) (1 - exp(-mobility
+    t)); below k_y no crease forms. The yield moment is M_y = B k_y; |e|^2 = e_ww^2 + e_ff^2 + 2 e_wf^2.
 
     Args:
         stiffness: as for ``Bending``.
@@ -53,34 +53,34 @@ class CreasingBending(Bending):
         self.yield_curvature = float(yield_curvature)
 
     def has_rest_curvature(self) -> bool:
-        """Always, it may have creases."""
+        """Return True: the sheet may have creases."""
         return True
 
     def coefficients(self) -> Coefficients:
-        """Those of the elastic sheet, and the mobility [..., 1, 1] 1/s."""
+        """Return the coefficients of ``Bending``, and the mobility [..., 1, 1] 1/s."""
         return super().coefficients()._replace(mobility=self.mobility.field)
 
     def initial_memory(self, x: Tensor) -> Tensor:
-        """[..., V, 3]: creases [1/m] along ww, ff, sqrt 2 wf; none."""
+        """Return creases of a new cloth, zero: [..., V, 3] 1/m along ww, ff, sqrt 2 wf."""
         return torch.zeros_like(x)
 
-    def update_memory(self, c: Coefficients, now: EffectInputs) -> Tensor:
-        """The excess of the elastic curvature flows into the crease."""
-        crease, curl, mobility = require_memory(now), cast("Tensor", c.curl), cast("Tensor", c.mobility)
-        elastic = self.stencil.fit_surface(now.x, now.compensation).curvature - curl - crease
+    def update_memory(self, c: Coefficients, inputs: EffectInputs) -> Tensor:
+        """Let the excess of the elastic curvature flow into the crease."""
+        crease, curl, mobility = require_memory(inputs), cast("Tensor", c.curl), cast("Tensor", c.mobility)
+        elastic = self.stencil.fit_surface(inputs.x, inputs.compensation).curvature - curl - crease
         size = safe_norm(elastic)
-        bent = size > self.yield_curvature
-        excess = torch.where(bent, 1 - self.yield_curvature / torch.where(bent, size, 1.0), 0.0)
-        return crease - torch.expm1(-mobility * now.dt) * excess * elastic
+        yields = size > self.yield_curvature
+        excess = torch.where(yields, 1 - self.yield_curvature / torch.where(yields, size, 1.0), 0.0)
+        return crease - torch.expm1(-mobility * inputs.dt) * excess * elastic
 
-    def rest_curvature(self, curl: Tensor, now: EffectInputs) -> Tensor:
-        """Curl and creases."""
-        return curl + require_memory(now)
+    def rest_curvature(self, curl: Tensor, inputs: EffectInputs) -> Tensor:
+        """Return the rest curvature of curl and creases together, [..., V, 3] 1/m."""
+        return curl + require_memory(inputs)
 
     def energy(self, c: Coefficients, x: Tensor, memory: Tensor | None = None) -> Tensor:
-        """Bending energy [...] J of a sheet with the creases ``memory`` [..., V, 3] 1/m; None: of a virgin one."""
+        """Compute the bending energy [...] J of a sheet with creases ``memory`` [..., V, 3] 1/m; None: without."""
         return super().energy(c if memory is None else c._replace(curl=cast("Tensor", c.curl) + memory), x)
 
     def extra_repr(self) -> str:
-        """One line of the data sheet."""
+        """Return the line of the data sheet: what ``Bending`` says, and the yield curvature."""
         return f"{super().extra_repr()}, yield_curvature={self.yield_curvature:g} 1/m"

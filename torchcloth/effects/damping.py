@@ -1,4 +1,4 @@
-"""Damping in proportion to mass."""
+"""Mass damping: a viscous force in proportion to mass."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ from .base import AbstractEffect, Amplitude
 class MassDamping(AbstractEffect):
     """Viscous force against absolute velocity, f = -rate m v.
 
-    Not a property of cloth; useful to let a sheet come to rest (``Cloth.settle``) and as a catch-all to be suspected.
+    It is not a property of cloth. It lets a sheet come to rest (``Cloth.settle``), and absorbs whatever else damps.
 
     Args:
-        rate: [1/s], >= 0.
+        rate: damping rate [1/s], >= 0.
 
     Raises:
         InvalidInput: negative rate.
@@ -29,13 +29,13 @@ class MassDamping(AbstractEffect):
         self.rate = PhysicalParameter(rate, "1/s", "nonnegative", name="mass damping rate")
 
     def coefficients(self) -> Tensor:
-        """[..., 1, 1] 1/s."""
+        """Return the rate, [..., 1, 1] 1/s."""
         return self.rate.field
 
-    def force(self, c: Tensor, now: EffectInputs) -> Tensor:
-        """Force on each vertex."""
-        return -(c * now.mass) * now.v
+    def force(self, c: Tensor, inputs: EffectInputs) -> Tensor:
+        """Return the force on each vertex."""
+        return -(c * inputs.mass) * inputs.v
 
     def stability_bounds(self, c: Tensor, mass: Tensor) -> tuple[Tensor, Tensor]:
-        """The rate itself."""
+        """Return the rate as the bound on damping."""
         return mass.new_zeros(()), c.amax()

@@ -1,4 +1,4 @@
-"""Friction between the yarns, when cloth is bent and when it is sheared."""
+"""Internal friction between the yarns, in bending and in shear."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from .._utils.linalg import cross, dot
 from ..meshes import Mesh
 from ..parameters import PhysicalParameter
 from ..types import EffectInputs
-from ._bent import BendingStencil
+from ._bending_stencil import BendingStencil
 from ._dahl import check_threshold, update_dahl_fraction
 from ._triangles import Triangles
 from .base import AbstractEffect, Amplitude, require_memory
@@ -18,9 +18,9 @@ from .base import AbstractEffect, Amplitude, require_memory
 class BendingFriction(AbstractEffect):
     """Bending moment z that opposes changes of curvature: z' = (HB / k_t) (k' - |k'| z / HB), Dahl's law.
 
-    Cloth keeps some of the bend it had, loops between loading and unloading, and the loss per cycle does not depend on
-    how fast it is: 4 HB (K - k_t tanh(K / k_t)) per area at curvatures from -K to K. z acts on the curvature along the
-    normal in material axes, so it turns with the sheet; k and z are tensors, |k'|^2 = k_ww'^2 + k_ff'^2 + 2 k_wf'^2, so
+    Cloth keeps a part of its bend, and its moment has a hysteresis loop. The loss per cycle does not depend on speed:
+    4 HB (K - k_t tanh(K / k_t)) per area for curvatures from -K to K. z acts on the curvature along the normal in
+    material axes, so it turns with the sheet. k and z are tensors with |k'|^2 = k_ww'^2 + k_ff'^2 + 2 k_wf'^2, so
     friction is the same in all directions.
 
     Args:
@@ -41,44 +41,44 @@ class BendingFriction(AbstractEffect):
         self.stencil = BendingStencil()
 
     def bind(self, mesh: Mesh) -> BendingFriction:
-        """Build the curvature stencils."""
+        """Build the curvature stencils, and return self."""
         self.stencil.bind(mesh, device=self.moment.raw.device)
         return self
 
     def coefficients(self) -> Tensor:
-        """HB [..., 1, 1] N."""
+        """Return HB, [..., 1, 1] N."""
         return self.moment.field
 
     def initial_memory(self, x: Tensor) -> Tensor:
-        """[..., V, 6]: curvature where the sheet is [1/m], and z / HB = 0."""
+        """Return the present curvature [1/m] and z / HB = 0, together [..., V, 6]."""
         k = self.stencil.fit_surface(x).curvature
         return torch.cat([k, torch.zeros_like(k)], dim=-1)
 
-    def update_memory(self, c: Tensor, now: EffectInputs) -> Tensor:
-        """Dahl's law along the change of curvature."""
-        before, share = _halves(now)
-        k = self.stencil.fit_surface(now.x, now.compensation).curvature
-        return torch.cat([k, update_dahl_fraction(share, k - before, self.threshold)], dim=-1)
+    def update_memory(self, c: Tensor, inputs: EffectInputs) -> Tensor:
+        """Integrate Dahl's law along the change of curvature."""
+        before, fraction = _split_memory(inputs)
+        k = self.stencil.fit_surface(inputs.x, inputs.compensation).curvature
+        return torch.cat([k, update_dahl_fraction(fraction, k - before, self.threshold)], dim=-1)
 
-    def force(self, c: Tensor, now: EffectInputs) -> Tensor:
-        """That of the moment z."""
-        _, share = _halves(now)
-        return self.stencil.moment_force(self.stencil.fit_surface(now.x, now.compensation), c * share)
+    def force(self, c: Tensor, inputs: EffectInputs) -> Tensor:
+        """Return the force of the moment z."""
+        _, fraction = _split_memory(inputs)
+        return self.stencil.moment_force(self.stencil.fit_surface(inputs.x, inputs.compensation), c * fraction)
 
     def stability_bounds(self, c: Tensor, mass: Tensor) -> tuple[Tensor, Tensor]:
-        """Twice the sticking stiffness, which is what a reversal out of sliding meets, and z's turning."""
+        """Bound omega^2 by twice the sticking stiffness, which a reversal out of sliding meets, and turning of z."""
         per_moment = 2 / self.threshold * self.stencil.bending_bound_over(mass) + self.stencil.turning_bound_over(mass)
         return c.amax() * per_moment, mass.new_zeros(())
 
     def extra_repr(self) -> str:
-        """One line of the data sheet."""
+        """Return the line of the data sheet: the threshold."""
         return f"threshold={self.threshold:g} 1/m"
 
 
 class ShearFriction(AbstractEffect):
     """Shear stress z that opposes changes of the angle between warp and weft: z' = (HG / g_t) (g' - |g'| z / HG).
 
-    g is the shear angle, right angle minus that between the yarns; see ``BendingFriction`` for the law.
+    g is the shear angle: a right angle minus the angle between the yarns. ``BendingFriction`` explains the law.
 
     Args:
         hysteresis: 2HG [N/m], >= 0, the full width of a KES-F loop. Fabrics have 0.5 to 4.
@@ -98,48 +98,48 @@ class ShearFriction(AbstractEffect):
         self.triangles = Triangles()
 
     def bind(self, mesh: Mesh) -> ShearFriction:
-        """Resolve the triangles."""
+        """Resolve the triangles, and return self."""
         self.triangles.bind(mesh, self.hysteresis.raw.device)
         return self
 
     @property
     def has_axes(self) -> bool:
-        """Yarns turn against each other."""
+        """Whether the effect distinguishes warp and weft: always."""
         return True
 
     def coefficients(self) -> Tensor:
-        """HG [..., 1, 1] N/m."""
+        """Return HG, [..., 1, 1] N/m."""
         return 0.5 * self.hysteresis.field
 
     def initial_memory(self, x: Tensor) -> Tensor:
-        """[..., E, 2]: shear angle where the sheet is [rad], and z / HG = 0."""
+        """Return the present shear angle [rad] and z / HG = 0, together [..., E, 2]."""
         f1, f2 = self.triangles.deformation_columns(x)
         normal = cross(f1, f2)
         angle = _angle(f1, f2, dot(normal, normal).sqrt())
         return torch.cat([angle, torch.zeros_like(angle)], dim=-1)
 
-    def update_memory(self, c: Tensor, now: EffectInputs) -> Tensor:
-        """Dahl's law along the change of angle."""
-        before, share = _halves(now)
-        angle = _angle(now.surface.f1, now.surface.f2, now.surface.J)
-        return torch.cat([angle, update_dahl_fraction(share, angle - before, self.threshold)], dim=-1)
+    def update_memory(self, c: Tensor, inputs: EffectInputs) -> Tensor:
+        """Integrate Dahl's law along the change of angle."""
+        before, fraction = _split_memory(inputs)
+        angle = _angle(inputs.surface.f1, inputs.surface.f2, inputs.surface.J)
+        return torch.cat([angle, update_dahl_fraction(fraction, angle - before, self.threshold)], dim=-1)
 
-    def force(self, c: Tensor, now: EffectInputs) -> Tensor:
-        """That of the stress z, which works on the angle alone."""
-        _, share = _halves(now)
-        s = now.surface
+    def force(self, c: Tensor, inputs: EffectInputs) -> Tensor:
+        """Return the force of the stress z, which works on the angle alone."""
+        _, fraction = _split_memory(inputs)
+        s = inputs.surface
         sine = dot(s.f1, s.f2)
-        scale = c * share / (sine**2 + s.J**2)
+        scale = c * fraction / (sine**2 + s.J**2)
         return self.triangles.stress_force(
             scale * (s.J * s.f2 - sine * s.cofactor1), scale * (s.J * s.f1 - sine * s.cofactor2)
         )
 
     def stability_bounds(self, c: Tensor, mass: Tensor) -> tuple[Tensor, Tensor]:
-        """Twice the sticking stiffness, which is what a reversal out of sliding meets."""
+        """Bound omega^2 by twice the sticking stiffness, which a reversal out of sliding meets."""
         return 2 / self.threshold * c.amax() * (self.triangles.shear_bound / mass).amax(), mass.new_zeros(())
 
     def extra_repr(self) -> str:
-        """One line of the data sheet."""
+        """Return the line of the data sheet: the threshold."""
         return f"threshold={self.threshold:g} rad"
 
 
@@ -147,6 +147,6 @@ def _angle(f1: Tensor, f2: Tensor, area: Tensor) -> Tensor:
     return torch.atan2(dot(f1, f2), area)
 
 
-def _halves(now: EffectInputs) -> tuple[Tensor, Tensor]:
-    before, share = require_memory(now).chunk(2, dim=-1)
-    return before, share
+def _split_memory(inputs: EffectInputs) -> tuple[Tensor, Tensor]:
+    strain, fraction = require_memory(inputs).chunk(2, dim=-1)
+    return strain, fraction

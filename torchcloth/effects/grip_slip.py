@@ -1,4 +1,4 @@
-"""A gripper that does not hold perfectly."""
+"""Grip slip: a gripper out of which the cloth creeps."""
 
 from __future__ import annotations
 
@@ -7,31 +7,36 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from .._utils.linalg import dot, apply_added_mass, safe_norm, matvec
+from .._utils.linalg import apply_added_mass, dot, matvec, safe_norm
 from ..parameters import PhysicalParameter
 from .base import AbstractEffect, Amplitude
 
 
 class Coefficients(NamedTuple):
-    """Of the parameters, each [..., 1, 1]."""
+    """Parameters as fields.
+
+    Attributes:
+        mobility: [..., 1, 1] m/(N s).
+        hold: [..., 1, 1] N.
+    """
 
     mobility: Tensor
     hold: Tensor
 
 
 class GripSlip(AbstractEffect):
-    """The held patch creeps out of a gripper along the pull F beyond what it can hold: u = mobility (|F| - hold).
+    """The gripped patch creeps out of a gripper when the pull F exceeds a threshold: u = mobility (|F| - hold).
 
-    A Bingham law for the patch as one body, implicit in u, so that any mobility is stable: with the impulse J that
-    holding the patch of mass M needs in one step, u = b (|J| / dt - hold) / (1 + b M / dt) against J. Mobility 0 is a
-    perfect grip; without bound, the grip becomes dry friction of force ``hold``. The patch stays the same vertices and
-    slides without turning; while ``Cloth.settle`` runs it holds. Air that moves along (``AddedMass``) counts in
-    the patch's mass, as far as the pull moves it.
+    This is a Bingham law for the patch as one body, implicit in u, so that any mobility is stable. With the impulse J
+    that fixing the patch of mass M needs in one step, u = b (|J| / dt - hold) / (1 + b M / dt) against J. Mobility 0 is
+    a perfect grip; for a mobility without bound the grip becomes dry friction of force ``hold``. The patch keeps its
+    vertices and slides without turning. It does not slip while ``Cloth.settle`` runs. Added mass (``AddedMass``) counts
+    in the patch's mass, as far as the pull moves the air.
 
     Args:
         grasp: name of the cloth's ``Grasp`` boundary.
-        mobility: b [m/(N s)], >= 0: a number, or [B, 1] for a batch, like ``hold``.
-        hold: [N], >= 0, the pull that the gripper bears without slipping.
+        mobility: b [m/(N s)], >= 0; a scalar, or [B, 1] for a batch, as ``hold``.
+        hold: pull that the gripper bears without slipping [N], >= 0.
 
     Raises:
         InvalidInput: negative values; a cloth without that grasp (when the cloth is made).
@@ -52,11 +57,11 @@ class GripSlip(AbstractEffect):
         self.hold = PhysicalParameter(hold, "N", "nonnegative", name="grip holding force")
 
     def coefficients(self) -> Coefficients:
-        """The parameters as fields."""
+        """Return the parameters as fields."""
         return Coefficients(self.mobility.field, self.hold.field)
 
     def grip_compliance(self, c: Coefficients) -> float:
-        """The mobility."""
+        """Return the mobility."""
         return float(c.mobility.detach().max())
 
     def grip_velocities(
@@ -69,7 +74,7 @@ class GripSlip(AbstractEffect):
         dt: float,
         added_mass_ratio: Tensor | None,
     ) -> Tensor:
-        """The patch moves on with the same velocity all over, so that its pull falls to what the law says."""
+        """Let the whole patch creep with one velocity, so that its pull falls to what the law allows."""
         patch = mass.index_select(-2, index)
         air = None if added_mass_ratio is None else added_mass_ratio.index_select(-3, index)
         change = (gripped - free).index_select(-2, index)
@@ -77,8 +82,9 @@ class GripSlip(AbstractEffect):
         size = safe_norm(impulse)
         inertia = patch.sum(-2, keepdim=True)
         if air is not None:
-            way = impulse / torch.where(size > 0, size, 1.0)
-            inertia = inertia + dot(way, matvec((patch.unsqueeze(-1) * air).sum(-3, keepdim=True), way))
+            direction = impulse / torch.where(size > 0, size, 1.0)
+            air_mass = (patch.unsqueeze(-1) * air).sum(-3, keepdim=True)
+            inertia = inertia + dot(direction, matvec(air_mass, direction))
         slips = size > c.hold * dt
         excess = torch.where(slips, 1 - c.hold * dt / torch.where(slips, size, 1.0), 0.0)
         creep = -(c.mobility * excess / (dt + c.mobility * inertia)) * impulse
@@ -86,5 +92,5 @@ class GripSlip(AbstractEffect):
         return gripped.expand(*creep.shape[:-2], -1, -1).index_add(-2, index, creep)
 
     def extra_repr(self) -> str:
-        """One line of the data sheet."""
+        """Return the line of the data sheet: name of the grasp."""
         return f"grasp={self.grasp!r}"

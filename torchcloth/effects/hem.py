@@ -1,4 +1,4 @@
-"""Mass along lines: hems and seams."""
+"""Line mass: extra mass along hems and seams."""
 
 from __future__ import annotations
 
@@ -15,24 +15,24 @@ from ..meshes import Mesh
 from ..parameters import PhysicalParameter
 from .base import AbstractEffect, Amplitude
 
-EDGE_WEIGHT_TOLERANCE = 1e-9  # barycentric weight, by which a line may be beside a triangle
+EDGE_WEIGHT_TOLERANCE = 1e-9  # barycentric weight by which a line may lie outside a triangle and still count
 
 
 class LineMass(AbstractEffect):
-    """Extra mass along lines of the cloth, at rest lengths: hems, seams, piping. It has weight only with ``Gravity``.
+    """Extra mass along lines of the cloth, per rest length: hems, seams, piping. It has weight only with ``Gravity``.
 
-    Contact between layers sees the areal density alone; the line's own bending stiffness is not modelled.
+    Contact between layers uses the areal density alone. The bending stiffness of the line is not modelled.
 
     Args:
-        mass_per_length: m_h [kg/m], >= 0: a number, or [B, 1] for a batch. Two extra layers of 150 g/m^2, 15 mm wide,
+        mass_per_length: m_h [kg/m], >= 0; a scalar, or [B, 1] for a batch. Two extra layers of 150 g/m^2, 15 mm wide,
             have 4.5e-3.
         edges: "boundary" (all free edges), "seams", or vertex pairs [N, 2] that are edges of the mesh.
-        path: [N, 2] m, places on the pattern that straight lines join, instead of edges. They cross the triangles as
-            they lie, and every vertex has the part of the line that is nearest to it by barycentric weights: the
-            same line on every mesh. What leaves the pattern has no mass.
+        path: [N, 2] m, pattern points that straight lines join, instead of edges. Lines may cross triangles: their mass
+            goes to the corners by barycentric weights, so the line is the same on every mesh. Parts outside the
+            pattern have no mass.
 
     Raises:
-        InvalidInput: negative mass; when bound, edges that the mesh does not have, or a path beside its pattern.
+        InvalidInput: negative mass; when bound, edges that the mesh does not have, or a path outside its pattern.
     """
 
     amplitudes = {"mass_per_length": Amplitude("kg/m", 4.5e-3, 1e-3, ("areal_density", "gravity.tilt"))}
@@ -53,20 +53,24 @@ class LineMass(AbstractEffect):
             raise InvalidInput("edges", got=repr(edges), expected='"boundary", "seams" or vertex pairs [N, 2]')
         self.mass_per_length = PhysicalParameter(mass_per_length, "kg/m", "nonnegative", name="mass per length")
         self.edges = edges if isinstance(edges, str) else np.asarray(edges)
-        self.path = None if path is None else _checked(np.asarray(path, dtype=np.float64))
+        self.path = None if path is None else _check_path(np.asarray(path, dtype=np.float64))
         self.register_buffer("length", torch.zeros(0, 1), persistent=False)
-        self.length: Tensor  # [V, 1] m, of the line, at each vertex
+        self.length: Tensor  # [V, 1] m, length of line at each vertex
 
     def bind(self, mesh: Mesh) -> LineMass:
-        """Half the rest length of every edge goes to each of its ends."""
+        """Distribute the line's length over the vertices, and return self; an edge gives half to each end.
+
+        Raises:
+            InvalidInput: edges that the mesh does not have, or a path outside its pattern.
+        """
         if self.path is None:
-            found, length = _rest_lengths(mesh)
-            place = _places(found, self._pairs(mesh))
-            share = np.bincount(found[place].ravel(), np.repeat(length[place] / 2, 2), minlength=len(mesh.vertices))
+            edges, length = _rest_lengths(mesh)
+            row = _edge_rows(edges, self._pairs(mesh))
+            per_vertex = np.bincount(edges[row].ravel(), np.repeat(length[row] / 2, 2), minlength=len(mesh.vertices))
         else:
-            share = _crossed(mesh, self.path)
+            per_vertex = _path_lengths(mesh, self.path)
         raw = self.mass_per_length.raw
-        self.length = torch.as_tensor(share, dtype=torch.get_default_dtype(), device=raw.device).unsqueeze(-1)
+        self.length = torch.as_tensor(per_vertex, dtype=torch.get_default_dtype(), device=raw.device).unsqueeze(-1)
         return self
 
     def _pairs(self, mesh: Mesh) -> np.ndarray:
@@ -78,24 +82,24 @@ class LineMass(AbstractEffect):
         return pairs
 
     def coefficients(self) -> Tensor:
-        """[..., 1, 1] kg/m."""
+        """Return the mass per length, [..., 1, 1] kg/m."""
         return self.mass_per_length.field
 
     def mass(self, c: Tensor) -> Tensor:
-        """The line's mass on its vertices."""
+        """Return the line's mass on its vertices."""
         return c * self.length
 
 
 def _rest_lengths(mesh: Mesh) -> tuple[np.ndarray, np.ndarray]:
-    """(all edges [N, 2], lower vertex first; rest lengths [N] m, the mean where two panels disagree)."""
+    """Return all edges [N, 2], lower vertex first, and their rest lengths [N] m, the mean where two panels differ."""
     sides = np.sort(mesh.faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
     length = np.linalg.norm(np.roll(mesh.rest, -1, axis=1) - mesh.rest, axis=-1).ravel()
     edges, inverse, count = np.unique(sides, axis=0, return_inverse=True, return_counts=True)
     return edges, np.bincount(inverse.ravel(), length) / count
 
 
-def _places(edges: np.ndarray, pairs: np.ndarray) -> np.ndarray:
-    """Rows of ``edges`` that are the vertex ``pairs``, each once."""
+def _edge_rows(edges: np.ndarray, pairs: np.ndarray) -> np.ndarray:
+    """Return the rows of ``edges`` that are the vertex ``pairs``, each once."""
     if pairs.ndim != 2 or pairs.shape[1] != 2 or len(pairs) == 0 or pairs.dtype.kind not in "iu":
         raise InvalidInput(
             "edges", got=f"shape {pairs.shape} of {pairs.dtype}", expected="vertex indices [N, 2], N > 0"
@@ -110,13 +114,13 @@ def _places(edges: np.ndarray, pairs: np.ndarray) -> np.ndarray:
     return np.array([row[pair] for pair in wanted])
 
 
-def _checked(path: np.ndarray) -> np.ndarray:
+def _check_path(path: np.ndarray) -> np.ndarray:
     if path.ndim != 2 or path.shape[1] != 2 or len(path) < 2 or not np.isfinite(path).all():
         raise InvalidInput("path", got=f"shape {path.shape}", expected="[N, 2] m on the pattern, N > 1, finite")
     return path
 
 
-def _crossed(mesh: Mesh, path: np.ndarray) -> np.ndarray:
+def _path_lengths(mesh: Mesh, path: np.ndarray) -> np.ndarray:
     """[V] m of the path's lines at each vertex: of what lies in a triangle, its corners' mean weights."""
     if mesh.pattern is None:
         raise InvalidInput("path", got="a mesh without pattern coordinates", expected="one that has them (vt)")

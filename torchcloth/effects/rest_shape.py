@@ -1,4 +1,4 @@
-"""A cloth that is not the size of its pattern."""
+"""Rest shape: a cloth that is not the size of its pattern."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from .base import AbstractEffect, Amplitude
 
 
 class Coefficients(NamedTuple):
-    """Of the parameters, each [..., E or 1, 1]."""
+    """Parameters as fields, each [..., E or 1, 1]: shrinkage [-] and skew [rad]."""
 
     shrink_warp: Tensor
     shrink_weft: Tensor
@@ -21,18 +21,21 @@ class Coefficients(NamedTuple):
 
 
 class RestShape(AbstractEffect):
-    """The true rest shape after washing or cutting askew: threads shorter than the pattern's, at another angle.
+    """The true rest shape after washing or cutting askew: shorter threads than in the pattern, at another angle.
 
-    The warp keeps its direction and 1 - shrink_warp of its length, the weft keeps 1 - shrink_weft and leans by ``skew``
-    towards the warp. The mass stays what the pattern says; the material law is measured per area of the true shape.
-    Bending keeps the pattern's lengths (an error of second order: shrinkage times bending). A law with yarns pulls
-    along right angles of the true shape, so a weft that leans is too soft along itself: by 4 % at 0.02 rad and a shear
-    modulus of a hundredth of the yarns', by 20 % at 0.05 (E / E' = cos^4 + sin^4 + (E / G - 2 nu) sin^2 cos^2).
+    The warp keeps its direction and 1 - shrink_warp of its length. The weft keeps 1 - shrink_weft of its length and
+    leans by ``skew`` towards the warp. The mass is that of the pattern; the material law is per area of the true shape.
+    Bending keeps the pattern's lengths, an error of second order (shrinkage times bending).
+
+    A law with yarns pulls along right angles of the true shape, so a leaning weft is too soft along itself. With a
+    shear modulus of a hundredth of the yarns' modulus the error is 4 % at 0.02 rad and 20 % at 0.05 rad (E / E' = cos^4
+    + sin^4 + (E / G - 2 nu) sin^2 cos^2).
 
     Args:
-        shrink_warp: s1 < 1; negative where the cloth has grown. Each is a scalar, one value per triangle, or [B, 1].
-        shrink_weft: s2 < 1.
-        skew: [rad], within a right angle.
+        shrink_warp: shrinkage of the warp s1 [-], < 1; negative where the cloth has grown. Like the others a scalar,
+            one value per triangle, or [B, 1].
+        shrink_weft: shrinkage of the weft s2 [-], < 1.
+        skew: angle by which the weft leans [rad], within a right angle.
 
     Raises:
         InvalidInput: values out of range.
@@ -56,15 +59,15 @@ class RestShape(AbstractEffect):
 
     @property
     def has_axes(self) -> bool:
-        """Shrinkage has a direction."""
+        """Whether the effect distinguishes warp and weft: always."""
         return True
 
     def coefficients(self) -> Coefficients:
-        """The parameters as fields."""
+        """Return the parameters as fields."""
         return Coefficients(self.shrink_warp.field, self.shrink_weft.field, self.skew.field)
 
     def rest_deformation(self, c: Coefficients) -> Tensor:
-        """Columns: the true warp and weft."""
+        """Return the rest deformation, whose columns are the true warp and weft."""
         warp, weft = 1 - c.shrink_warp, 1 - c.shrink_weft
         rows = torch.broadcast_tensors(warp, weft * c.skew.sin(), torch.zeros_like(warp), weft * c.skew.cos())
         return torch.cat(rows, dim=-1).unflatten(-1, (2, 2))

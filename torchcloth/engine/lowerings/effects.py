@@ -104,14 +104,14 @@ def _shear_friction(low: Lowering, name: str, effect: ShearFriction, c: Any) -> 
 
 def _residual(low: Lowering, name: str, effect: ResidualForce, c: Residual) -> None:
     t = low.triangles
-    if c.drags:
+    if c.has_drag:
         none = t.loop.load(low.number(0.0))
         laws = [none if part is None else t.parameter(part) for part in c[:4]]
         t.push("local_drag", *t.x, *t.v, *laws, t.area)
     if c.strain_rate is not None:
         _strain_rate(low, c.strain_rate)
     if c.bend is not None:
-        sheet = low.sheet(effect.sheet)
+        sheet = low.sheet(effect.stencil)
         sheet.moment(sheet.loop.call("scaled3", sheet.loop.load(low.parameter(c.bend)), sheet.curvature))
 
 
