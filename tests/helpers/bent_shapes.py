@@ -33,7 +33,7 @@ def cylinder(mesh, curvature, degrees=0.0):
 
 @cache
 def model(mesh):
-    return tc.Cloth(mesh, tc.materials.AEP(1e3), 0.2, contact=None).model()
+    return tc.Cloth(mesh, tc.materials.AEP(1e3), 0.2, contact=None).build_model()
 
 
 def moment(mesh, x, memory=None, dt=0.0):
@@ -44,7 +44,7 @@ def moment(mesh, x, memory=None, dt=0.0):
 
 def through(effect, mesh, path, dt=0.0):
     """Internal variables after each of the positions of ``path``, from a virgin sheet at the first."""
-    memory = effect.start(path[0])
+    memory = effect.initial_memory(path[0])
     found = [memory]
     for x in path[1:]:
         memory = effect.update_memory(effect.coefficients(), moment(mesh, x, memory, dt))
@@ -77,7 +77,7 @@ def drift(effects, steps=100, seed=0):
     v = 0.3 * torch.randn(x.shape, generator=generator)
     with torch.no_grad():
         out = cloth(cloth.state(x, v), times=(0.0, steps * cloth.stable_step()))
-    mass = cloth.model().mass
+    mass = cloth.build_model().mass
     momenta = [(mass * u).sum(0) for u in out.v]
     turning = [(mass * torch.linalg.cross(y, u)).sum(0) for y, u in zip(out.x, out.v, strict=True)]
     scale = (mass * out.v[0].norm(dim=-1, keepdim=True)).sum()

@@ -144,7 +144,9 @@ def test_bending_stiffness_is_at_hand():
     bending = tc.effects.Bending(presets.find_fabric("M15-B").bending_warp)
     mesh = tc.meshes.rectangle(0.1, 0.1, triangles=50)
     material = AEP.preset("M15-B", youngs_modulus=1e6)
-    cloth = tc.Cloth(mesh, material, presets.find_fabric("M15-B").areal_density, effects={"bending": bending}, contact=None)
+    cloth = tc.Cloth(
+        mesh, material, presets.find_fabric("M15-B").areal_density, effects={"bending": bending}, contact=None
+    )
     assert float(cloth.effects["bending"].stiffness.value.detach()) == pytest.approx(6.5705e-6)
 
 

@@ -150,7 +150,7 @@ def test_it_says_what_it_does_and_refuses_what_it_does_not_know():
     for terms in ({}, {"magnetism": 1.0}, {"across@hem": 1.0}):
         with pytest.raises(InvalidInput, match="terms"):
             ResidualForce(terms)
-    with pytest.raises(InvalidInput, match="held; got vertex 36; expected 0 to 35"):
+    with pytest.raises(InvalidInput, match="gripped_vertices; got vertex 36; expected 0 to 35"):
         ResidualForce({"across": 1.0}, gripped_vertices=[0, 36]).bind(tc.meshes.rectangle(0.2, 0.2, resolution=(6, 6)))
 
 

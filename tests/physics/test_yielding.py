@@ -20,7 +20,7 @@ def sheet(limit=LIMIT, nu=0.3, effects=None, boundaries=None, material=None, res
 
 def flow(material, f1, f2, inelastic=None):
     """The inelastic part after bringing triangles that have set by ``inelastic`` to a deformation."""
-    inelastic = material.start(f1.shape[-2]).to(f1) if inelastic is None else inelastic
+    inelastic = material.initial_memory(f1.shape[-2]).to(f1) if inelastic is None else inelastic
     f = torch.stack([f1, f2], dim=-1) @ inelastic.unflatten(-1, (2, 2))
     return material.flow(material.coefficients(), samples.surface(*f.unbind(-1)), inelastic)
 

@@ -1,4 +1,4 @@
-"""Constitutive laws, one per file."""
+"""Constitutive laws of the sheet, one per file, and published fabrics."""
 
 from . import presets
 from .aep import AEP

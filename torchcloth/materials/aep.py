@@ -1,4 +1,4 @@
-"""Anisotropic elasto-plastic cloth (Jiang, Gast, Teran 2017), the law of the DiffCP paper.
+"""Anisotropic elasto-plastic cloth (A-EP; Jiang, Gast, Teran 2017), the law of the DiffCP paper.
 
 The membrane is in ``corotated``, the law across the sheet in ``director``.
 """
@@ -19,14 +19,23 @@ from .yielding import NormYield
 
 
 class Coefficients(NamedTuple):
-    """Stress resultants [N/m] (moduli times thickness) and the cone; each [..., E or 1, 1]."""
+    """Stress resultants (moduli times thickness) and friction, each [..., E or 1, 1].
+
+    Attributes:
+        mu: Lame parameter [N/m].
+        lam: Lame parameter [N/m].
+        contact: k h [N/m].
+        shear: gamma h [N/m], already doubled in the paper's convention.
+        cone: c_F [-].
+        limit: of the elastic stretch [-], infinite without plasticity.
+    """
 
     mu: Tensor
     lam: Tensor
-    contact: Tensor  # k h
-    shear: Tensor  # gamma h, already doubled in the paper's convention
-    cone: Tensor  # c_F
-    limit: Tensor  # of the elastic stretch, infinite without plasticity
+    contact: Tensor
+    shear: Tensor
+    cone: Tensor
+    limit: Tensor
 
 
 class AEP(DirectorMaterial):
@@ -72,10 +81,10 @@ class AEP(DirectorMaterial):
 
     @classmethod
     def preset(cls, name: str, **changes) -> AEP:
-        """A published isotropic fabric by name; ``changes`` override or complete its numbers. See ``presets``.
+        """Build a published isotropic fabric by name; ``changes`` override or complete its numbers. See ``presets``.
 
-        The paper's k = 6520 N/m / h makes contact on a fine grid slow (steps of 1e-5 s at 4 mm); where only the contact
-        itself matters, ``contact_stiffness=5e4, shear_stiffness=2e4`` is ten times faster.
+        The paper's k = 6520 N/m / h makes contact on a fine grid slow (steps of 1e-5 s at 4 mm). If only contact
+        as such matters, ``contact_stiffness=5e4, shear_stiffness=2e4`` is ten times faster.
 
         Raises:
             InvalidInput: no such fabric, or one whose membrane stiffness was not published or is not isotropic.
@@ -86,11 +95,11 @@ class AEP(DirectorMaterial):
 
     @property
     def membrane_stiffness(self) -> Tensor:
-        """Y = E h [N/m], the stiffness that data can see."""
+        """Membrane stiffness Y = E h [N/m], which data can identify."""
         return self.youngs_modulus.value * self.thickness
 
     def coefficients(self) -> Coefficients:
-        """Lame parameters and director stiffnesses times thickness."""
+        """Return Lame parameters and director stiffnesses times thickness."""
         paper = self.convention == "paper"
         youngs, nu = self.youngs_modulus.field * self.thickness, self.poisson_ratio.field
         lam = youngs * nu / ((1 + nu) * (1 - 2 * nu)) if paper else youngs * nu / (1 - nu * nu)
@@ -100,17 +109,17 @@ class AEP(DirectorMaterial):
         return Coefficients(mu=youngs / (2 * (1 + nu)), lam=lam, **director)
 
     def membrane_energy(self, c: Coefficients, surface: Surface) -> Tensor:
-        """mu sum (sigma_i - 1)^2 + lambda/2 (J - 1)^2."""
+        """Return mu sum (sigma_i - 1)^2 + lambda/2 (J - 1)^2."""
         return corotated.energy(c.mu, surface) + 0.5 * c.lam * (surface.J - 1) ** 2
 
     def membrane_stress(self, c: Coefficients, surface: Surface) -> tuple[Tensor, Tensor]:
-        """Its exact derivative."""
+        """Return the exact derivative of the energy."""
         return corotated.stress(c.mu, c.lam * (surface.J - 1), surface)
 
     def stiffness(self, c: Coefficients) -> Stiffness:
-        """The director's normal tangent 2 k (1 - R33) is taken at half compression."""
+        """Return the tangents at rest; the director's normal one, 2 k (1 - R33), at half compression."""
         return Stiffness.isotropic(c.lam, c.mu, c.contact, c.shear)
 
     def extra_repr(self) -> str:
-        """Constants of the data sheet."""
+        """Return the line of the data sheet: thickness and convention."""
         return f"{super().extra_repr()}, convention={self.convention}"

@@ -1,4 +1,4 @@
-"""What a cloth material must answer."""
+"""Base class of materials, and the stiffness that bounds the stable step."""
 
 from __future__ import annotations
 
@@ -13,76 +13,87 @@ from ..types import Surface
 class Stiffness(NamedTuple):
     """Largest tangents of a material as stress resultants [N/m], each [..., E or 1, 1]; they bound the stable step.
 
-    In the plane, in the material's axes: a strain e does not raise the energy by more than half of
-    warp e11^2 + weft e22^2 + 2 coupling e11 e22 + in_plane_shear (2 e12)^2. Where a law stiffens with strain, take its
-    stiffest state; ``stability.SAFETY`` covers a factor of two beyond what is stated here.
+    In the plane, in the material's axes, a strain e must not raise the energy by more than half of warp e11^2 + weft
+    e22^2 + 2 coupling e11 e22 + in_plane_shear (2 e12)^2. For a law that stiffens with strain take the stiffest state.
+    ``stability.STEP_SAFETY_FACTOR`` covers a factor of two beyond these values.
+
+    Attributes:
+        warp: lambda + 2 mu of an isotropic law.
+        weft: lambda + 2 mu of an isotropic law.
+        coupling: lambda of an isotropic law.
+        in_plane_shear: mu of an isotropic law.
+        normal: of the director's compression.
+        shear: of the director's shear.
     """
 
-    warp: Tensor  # lambda + 2 mu of an isotropic law
-    weft: Tensor  # likewise
-    coupling: Tensor  # lambda
-    in_plane_shear: Tensor  # mu
-    normal: Tensor  # of the director's compression
-    shear: Tensor  # of the director's shear
+    warp: Tensor
+    weft: Tensor
+    coupling: Tensor
+    in_plane_shear: Tensor
+    normal: Tensor
+    shear: Tensor
 
     @classmethod
     def isotropic(cls, lam: Tensor, mu: Tensor, normal: Tensor, shear: Tensor) -> Stiffness:
-        """From Lame parameters."""
+        """Build from Lame parameters times thickness, and the director's tangents, all N/m."""
         return cls(lam + 2 * mu, lam + 2 * mu, lam, mu, normal, shear)
 
 
 class AbstractMaterial(nn.Module, ABC):
     """A thin sheet: a membrane law in the surface, and a director law for contact and friction across it.
 
-    Everything is per unit of rest area (thickness already multiplied in): energies in J/m^2, stresses in N/m.
-    ``coefficients`` is called once per rollout; the other methods are pure functions of what it returns, whose tensors
-    broadcast against [..., E, 3]. For the director law they are given with one more axis, [..., E, 1, 1], and meet
+    Everything is per unit of rest area, with the thickness multiplied in: energies in J/m^2, stresses in N/m.
+    ``coefficients`` is called once per rollout. The other methods are pure functions of what it returned, ``c``, whose
+    tensors broadcast with [..., E, 3]. For the director law they have one more axis, [..., E, 1, 1], and broadcast with
     n [..., E, 1, 3] and d3 [..., E, S, 3] (S contact points per triangle).
     """
 
     @property
     def has_axes(self) -> bool:
-        """Whether warp and weft differ: then the mesh must have a pattern."""
+        """Whether the law distinguishes warp and weft, so that the mesh must have a pattern."""
         return False
 
     @abstractmethod
     def coefficients(self) -> Any:
-        """NamedTuple of tensors [..., E or 1, 1] derived from the learnable parameters."""
+        """Return a NamedTuple of tensors [..., E or 1, 1] that are computed from the learnable parameters."""
 
     @abstractmethod
     def membrane_energy(self, c: Any, surface: Surface) -> Tensor:
-        """[..., E, 1] J/m^2."""
+        """Return the energy density of the membrane, [..., E, 1] J/m^2."""
 
     @abstractmethod
     def membrane_stress(self, c: Any, surface: Surface) -> tuple[Tensor, Tensor]:
-        """Columns (P1, P2) of the first Piola-Kirchhoff resultant d(energy)/dF, each [..., E, 3] N/m."""
+        """Return the columns of the first Piola-Kirchhoff resultant d(energy)/dF, each [..., E, 3] N/m."""
 
     @abstractmethod
     def director_energy(self, c: Any, n: Tensor, d3: Tensor) -> Tensor:
-        """[..., E, S, 1] J/m^2, of the director d3 against the surface's unit normal n."""
+        """Return the energy density [..., E, S, 1] J/m^2 of the director d3 against the surface's unit normal n."""
 
     @abstractmethod
     def director_stress(self, c: Any, n: Tensor, d3: Tensor) -> tuple[Tensor, Tensor]:
-        """(d(energy)/dn, d(energy)/dd3), each [..., E, S, 3] N/m; n is varied freely, the caller projects."""
+        """Return d(energy)/dn and d(energy)/dd3, each [..., E, S, 3] N/m, with n varied freely: the caller projects."""
 
     @abstractmethod
     def return_map(self, c: Any, n: Tensor, d3: Tensor) -> Tensor:
-        """The elastic director after plastic flow, [..., E, S, 3]; idempotent."""
+        """Return the elastic director after plastic flow, [..., E, S, 3]; must be idempotent."""
 
     def initial_memory(self, triangles: int) -> Tensor | None:
-        """Inelastic part A of a virgin sheet's deformation [E, 4] = (A11, A12, A21, A22); None: always elastic.
+        """Return A = (A11, A12, A21, A22) [E, 4] of a new sheet; None: the membrane is always elastic.
 
-        The membrane law is given the elastic deformation F_E = F A, A the inverse of the plastic set.
+        A is the inverse of the plastic set: the membrane law acts on the elastic deformation F_E = F A.
         """
         return None
 
     def flow(self, c: Any, trial: Surface, inverse_plastic: Tensor) -> Tensor:
-        """The inelastic part [..., E, 4] after plastic flow; idempotent.
+        """Return A [..., E, 4] after plastic flow; must be idempotent.
 
-        ``elastic`` is the deformation F A that would be elastic if nothing flowed.
+        Args:
+            c: coefficients.
+            trial: the deformation F A, which would be elastic if nothing flowed.
+            inverse_plastic: A [..., E, 4] before the flow.
         """
-        raise NotImplementedError(f"{type(self).__name__} starts a plastic set but does not let it flow")
+        raise NotImplementedError(f"{type(self).__name__} has initial_memory, but does not override flow")
 
     @abstractmethod
     def stiffness(self, c: Any) -> Stiffness:
-        """Largest tangents, for the stable step."""
+        """Return the largest tangents, which bound the stable step."""

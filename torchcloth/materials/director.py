@@ -25,7 +25,7 @@ class DirectorMaterial(AbstractMaterial, ABC):
 
     Director energy: gamma/2 |r|^2 + k/3 (1 - R33)^3 for R33 < 1; friction |gamma r| <= c_F k (1 - R33)^2.
 
-    The subclass's coefficients carry the entries of ``_director`` by the same names.
+    The subclass's coefficients contain, under the same names, the entries of ``_director_coefficients``.
     """
 
     def __init__(self, thickness: float) -> None:
@@ -45,7 +45,7 @@ class DirectorMaterial(AbstractMaterial, ABC):
         cone: float | Tensor,
         plastic: NormYield | None,
     ) -> None:
-        """Add the other parameters after those of the membrane: reports list them in this order."""
+        """Add the parameters after those of the membrane: reports list them in this order."""
         self.contact_stiffness = PhysicalParameter(contact_stiffness, "Pa", name="contact_stiffness")
         self.shear_stiffness = PhysicalParameter(shear_stiffness, "Pa", name="shear_stiffness")
         self.cone = PhysicalParameter(cone, "-", "nonnegative", name="cone")
@@ -56,7 +56,7 @@ class DirectorMaterial(AbstractMaterial, ABC):
         self.plastic = plastic
 
     def _director_coefficients(self) -> dict[str, Tensor]:
-        """k h and gamma h [N/m], c_F, and the limit of elastic stretch (infinite without plasticity)."""
+        """Return k h and gamma h [N/m], c_F, and the limit of elastic stretch (infinite without plasticity)."""
         cone = self.cone.field
         return {
             "contact": self.contact_stiffness.field * self.thickness,
@@ -66,20 +66,20 @@ class DirectorMaterial(AbstractMaterial, ABC):
         }
 
     def director_energy(self, c: Any, n: Tensor, d3: Tensor) -> Tensor:
-        """gamma/2 |r|^2 + k/3 (1 - R33)^3 for R33 < 1."""
+        """Return gamma/2 |r|^2 + k/3 (1 - R33)^3 for R33 < 1."""
         height = dot(n, d3)
         gap = (1 - height).clamp(min=0)
         return 0.5 * c.shear * (dot(d3, d3) - height * height) + c.contact / 3 * gap**3
 
     def director_stress(self, c: Any, n: Tensor, d3: Tensor) -> tuple[Tensor, Tensor]:
-        """Derivatives with respect to n and d3."""
+        """Return the derivatives of the energy with respect to n and d3."""
         height = dot(n, d3)
         gap = (1 - height).clamp(min=0)
         slope = c.shear * height + c.contact * gap * gap
         return -slope * d3, c.shear * d3 - slope * n
 
     def return_map(self, c: Any, n: Tensor, d3: Tensor) -> Tensor:
-        """Separation (R33 > 1) relaxes the director to n; otherwise the shear is cut to the friction cone."""
+        """Relax the director to n where layers separate (R33 > 1); otherwise cut its shear to the friction cone."""
         height = dot(n, d3)
         r = d3 - height * n
         length = safe_norm(r)
@@ -91,13 +91,13 @@ class DirectorMaterial(AbstractMaterial, ABC):
         return torch.where(height > 1, n, keep * r + height * n)
 
     def initial_memory(self, triangles: int) -> Tensor | None:
-        """No plastic set yet."""
+        """Return the state without plastic set; None without plasticity."""
         return None if self.plastic is None else self.plastic.initial_memory(triangles)
 
     def flow(self, c: Any, trial: Surface, inverse_plastic: Tensor) -> Tensor:
-        """The plastic law's."""
+        """Let the plastic law flow, if there is one."""
         return inverse_plastic if self.plastic is None else self.plastic.flow(c.limit, trial, inverse_plastic)
 
     def extra_repr(self) -> str:
-        """Constants of the data sheet."""
+        """Return the line of the data sheet: thickness."""
         return f"thickness={self.thickness:g} m"

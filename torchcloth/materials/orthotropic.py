@@ -30,26 +30,40 @@ from .yielding import NormYield
 
 
 class Coefficients(NamedTuple):
-    """Stress resultants [N/m] (moduli times thickness), the cone and the limit; each [..., E or 1, 1]."""
+    """Stress resultants (moduli times thickness), friction and the plastic limit, each [..., E or 1, 1].
 
-    mu: Tensor  # G h
+    Attributes:
+        mu: G h [N/m].
+        lam: lambda h [N/m].
+        balance: a [-], 1 for equal moduli.
+        warp: k1 h [N/m], beyond what the sheet carries.
+        weft: k2 h [N/m].
+        warp_toe: E_warp h times its stiffening [N/m].
+        weft_toe: E_weft h times its stiffening [N/m].
+        contact: k h [N/m].
+        shear: gamma h [N/m].
+        cone: c_F [-].
+        limit: of the elastic stretch [-], infinite without plasticity.
+    """
+
+    mu: Tensor
     lam: Tensor
-    balance: Tensor  # a [-], 1 for equal moduli
-    warp: Tensor  # k1 h, beyond what the sheet carries
-    weft: Tensor  # k2 h
-    warp_toe: Tensor  # E_warp h times its stiffening
+    balance: Tensor
+    warp: Tensor
+    weft: Tensor
+    warp_toe: Tensor
     weft_toe: Tensor
-    contact: Tensor  # k h
-    shear: Tensor  # gamma h
-    cone: Tensor  # c_F
-    limit: Tensor  # of the elastic stretch, infinite without plasticity
+    contact: Tensor
+    shear: Tensor
+    cone: Tensor
+    limit: Tensor
 
 
 class WovenMaterial(DirectorMaterial, ABC):
-    """The law of this module; a subclass says what its coefficients are.
+    """The law of this module; a subclass computes the coefficients.
 
     Attributes:
-        stiffening_reach: strain up to which tension stiffens.
+        stiffening_reach: strain [-] up to which tension stiffens.
     """
 
     def __init__(self, thickness: float, stiffening_reach: float) -> None:
@@ -60,11 +74,13 @@ class WovenMaterial(DirectorMaterial, ABC):
 
     @property
     def has_axes(self) -> bool:
-        """Yarns have directions, also where both are alike."""
+        """Whether the law distinguishes warp and weft: always, because yarns have directions."""
         return True
 
-    def _woven_coefficients(self, warp: Tensor, weft: Tensor, mu: Tensor, nu: Tensor, c1: Tensor, c2: Tensor) -> Coefficients:
-        """Of moduli times thickness [N/m], and the stiffening of warp and weft [-]."""
+    def _woven_coefficients(
+        self, warp: Tensor, weft: Tensor, mu: Tensor, nu: Tensor, c1: Tensor, c2: Tensor
+    ) -> Coefficients:
+        """Return the coefficients for moduli times thickness [N/m] and the stiffening of warp and weft [-]."""
         return Coefficients(
             mu=mu,
             lam=nu * (warp * weft).sqrt() / (1 - nu * nu),
@@ -77,7 +93,7 @@ class WovenMaterial(DirectorMaterial, ABC):
         )
 
     def membrane_energy(self, c: Coefficients, surface: Surface) -> Tensor:
-        """Density of the module's docstring, and what stiffening adds."""
+        """Return the energy density of the module's docstring, with what stiffening adds."""
         warp, weft = safe_norm(surface.f1) - 1, safe_norm(surface.f2) - 1
         squares = c.warp * warp * warp + c.weft * weft * weft + c.lam * _dilation(c, surface, warp, weft) ** 2
         stiffer = stiffening.energy(c.warp_toe, warp, self.stiffening_reach)
@@ -85,7 +101,7 @@ class WovenMaterial(DirectorMaterial, ABC):
         return corotated.energy(c.mu, surface) + 0.5 * squares + stiffer
 
     def membrane_stress(self, c: Coefficients, surface: Surface) -> tuple[Tensor, Tensor]:
-        """Its exact derivative: that of the sheet, and tensions along the yarns."""
+        """Return the exact derivative of the energy: that of the sheet, and tensions along the yarns."""
         length1, length2 = safe_norm(surface.f1), safe_norm(surface.f2)
         warp, weft = length1 - 1, length2 - 1
         pressure = c.lam * _dilation(c, surface, warp, weft)
@@ -97,13 +113,13 @@ class WovenMaterial(DirectorMaterial, ABC):
         return p1 + tension1 / length1 * surface.f1, p2 + tension2 / length2 * surface.f2
 
     def stiffness(self, c: Coefficients) -> Stiffness:
-        """In the plane at ``stiffening_reach``; the director's normal tangent 2 k (1 - R33) at half compression."""
+        """Return in-plane tangents at ``stiffening_reach``, and the director's, 2 k (1 - R33), at half compression."""
         warp = c.warp + 2 * c.mu + c.lam * c.balance**2 + stiffening.tangent(c.warp_toe, self.stiffening_reach)
         weft = c.weft + 2 * c.mu + c.lam / c.balance**2 + stiffening.tangent(c.weft_toe, self.stiffening_reach)
         return Stiffness(warp, weft, c.lam, c.mu, c.contact, c.shear)
 
     def extra_repr(self) -> str:
-        """Constants of the data sheet."""
+        """Return the line of the data sheet: thickness and stiffening reach."""
         return f"{super().extra_repr()}, stiffening_reach={self.stiffening_reach:g}"
 
 
@@ -159,7 +175,7 @@ class OrthotropicAEP(WovenMaterial):
 
     @classmethod
     def preset(cls, name: str, **changes) -> OrthotropicAEP:
-        """A published fabric by name; ``changes`` override or complete its numbers. See ``presets``.
+        """Build a published fabric by name; ``changes`` override or complete its numbers. See ``presets``.
 
         Raises:
             InvalidInput: no such fabric, or one without published stiffness in warp, weft or shear.
@@ -169,7 +185,7 @@ class OrthotropicAEP(WovenMaterial):
         return cls(**find_fabric(name).orthotropic(**changes))
 
     def coefficients(self) -> Coefficients:
-        """Stiffnesses times thickness."""
+        """Return stiffnesses times thickness."""
         warp, weft = self.youngs_modulus.field * self.thickness, self.weft_modulus.field * self.thickness
         mu, nu = self.shear_modulus.field * self.thickness, self.poisson_ratio.field
         return self._woven_coefficients(warp, weft, mu, nu, self.warp_stiffening.field, self.weft_stiffening.field)
@@ -182,7 +198,7 @@ class StiffeningAEP(WovenMaterial):
         youngs_modulus: E [Pa]. Scalar or one value per triangle, like every parameter here.
         poisson_ratio: nu, in (0, 0.5).
         stiffening: c [-] >= 0; Saint Venant and Kirchhoff's membrane has 1.5, fabrics have 5 to 50.
-        contact_stiffness: as of ``OrthotropicAEP``, and so are those that follow.
+        contact_stiffness: as for ``OrthotropicAEP``, like the arguments that follow.
 
     Raises:
         InvalidInput: a parameter outside its domain.
@@ -207,12 +223,12 @@ class StiffeningAEP(WovenMaterial):
         self._add_director_parameters(contact_stiffness, shear_stiffness, cone, plastic)
 
     def coefficients(self) -> Coefficients:
-        """Stiffnesses times thickness."""
+        """Return stiffnesses times thickness."""
         modulus, nu = self.youngs_modulus.field * self.thickness, self.poisson_ratio.field
         c = self.stiffening.field
         return self._woven_coefficients(modulus, modulus, modulus / (2 * (1 + nu)), nu, c, c)
 
 
 def _dilation(c: Coefficients, surface: Surface, warp: Tensor, weft: Tensor) -> Tensor:
-    """J - 1 with warp and weft weighted by stiffness, so that it couples them as plane stress does."""
+    """Return J - 1 with warp and weft weighted by stiffness, so that it couples them as plane stress does."""
     return surface.J - 1 + (c.balance - 1) * warp + (1 / c.balance - 1) * weft

@@ -1,9 +1,9 @@
-"""Published fabrics, each with its source. What a source does not give stays empty: nothing is filled in.
+"""Published fabrics, each with its source. What a source does not give stays empty.
 
-Numbers are stress resultants [N/m] as published, and only they are observable; where a source gives no thickness the
-moduli are made with a nominal 1 mm. Grades: A read in the primary document, B a full transcription, C secondary.
-Arguments that neither the table nor the user gives keep the law's defaults. ``fabrics.csv`` beside this file is the
-table. Numbers of the DiffCP paper have no unit there; their reading as kPa at 1 mm is stated with them.
+Numbers are stress resultants [N/m] as published; only they are observable. Where a source gives no thickness, moduli
+are computed with a nominal 1 mm. Grades: A read in the primary document, B a full transcription, C secondary. Arguments
+that neither the table nor the user gives keep the law's defaults. The table is ``fabrics.csv`` in this folder. Numbers
+of the DiffCP paper have no unit there; the table says that they are read as kPa at 1 mm.
 """
 
 from __future__ import annotations
@@ -17,27 +17,50 @@ from ..errors import InvalidInput
 
 _Numbers = dict[str, float | None]
 
-NOMINAL_THICKNESS_M = 1e-3  # m, thickness where none is published: stands in E = Y / h and drops out of every force
+NOMINAL_THICKNESS_M = 1e-3  # where none is published; it cancels in every force, because E = Y / h
 
 
 class Fabric(NamedTuple):
-    """One row of the table; None where the source gives no number."""
+    """One row of the table; a number is None where the source does not give it.
+
+    Attributes:
+        name: by which a preset is called.
+        fabric: description.
+        structure: weave or knit.
+        areal_density: [kg/m^2].
+        thickness: [m].
+        membrane_warp: Young's modulus times thickness along the warp [N/m].
+        membrane_weft: Young's modulus times thickness along the weft [N/m].
+        membrane_shear: shear modulus times thickness in the plane [N/m].
+        poisson: contraction of the weft under tension of the warp [-].
+        contact: k h of the director [N/m].
+        sliding: gamma h of the director [N/m].
+        bending_warp: [N m], for ``effects.Bending``.
+        bending_weft: [N m].
+        bending_hysteresis: 2HB of KES [N].
+        drape: drape coefficient [%].
+        drape_nodes: number of folds in the drape test.
+        friction: mu [-].
+        grade: of the source, see above.
+        source: citation.
+        note: remarks.
+    """
 
     name: str
     fabric: str
     structure: str
-    areal_density: float | None  # kg/m^2
-    thickness: float | None  # m
-    membrane_warp: float | None  # N/m, Young's modulus times thickness
-    membrane_weft: float | None  # N/m
-    membrane_shear: float | None  # N/m, in the plane
-    poisson: float | None  # weft contraction under warp tension
-    contact: float | None  # N/m, k h of the director
-    sliding: float | None  # N/m, gamma h of the director
-    bending_warp: float | None  # N m, for ``effects.Bending``
-    bending_weft: float | None  # N m
-    bending_hysteresis: float | None  # N, 2HB of KES
-    drape: float | None  # %
+    areal_density: float | None
+    thickness: float | None
+    membrane_warp: float | None
+    membrane_weft: float | None
+    membrane_shear: float | None
+    poisson: float | None
+    contact: float | None
+    sliding: float | None
+    bending_warp: float | None
+    bending_weft: float | None
+    bending_hysteresis: float | None
+    drape: float | None
     drape_nodes: float | None
     friction: float | None
     grade: str
@@ -45,7 +68,7 @@ class Fabric(NamedTuple):
     note: str
 
     def isotropic(self, **changes: Any) -> dict[str, Any]:
-        """Arguments of ``AEP``: what is published, then ``changes``.
+        """Return the arguments of ``AEP``: what is published, then ``changes``.
 
         Raises:
             InvalidInput: the membrane stiffness is not published or not isotropic, and ``changes`` do not give it.
@@ -59,11 +82,11 @@ class Fabric(NamedTuple):
             )
         given = {"youngs_modulus": self.membrane_warp, **self._director()}
         if self.poisson is not None and "poisson_ratio" not in changes:
-            self._checked(self.poisson)
+            self._check_poisson(self.poisson)
         return self._arguments(given, self.poisson, ["youngs_modulus"], changes)
 
     def orthotropic(self, **changes: Any) -> dict[str, Any]:
-        """Arguments of ``OrthotropicAEP``: what is published, then ``changes``.
+        """Return the arguments of ``OrthotropicAEP``: what is published, then ``changes``.
 
         Raises:
             InvalidInput: a membrane stiffness is not published, and ``changes`` do not give it.
@@ -76,7 +99,7 @@ class Fabric(NamedTuple):
         given = self._arguments({**membrane, **self._director()}, self.poisson, list(membrane), changes)
         if self.poisson is not None and "poisson_ratio" not in changes:  # the symmetric one, of the moduli as they are
             weft, warp = given["weft_modulus"], given["youngs_modulus"]
-            given["poisson_ratio"] = self._checked(self.poisson * (weft / warp) ** 0.5)
+            given["poisson_ratio"] = self._check_poisson(self.poisson * (weft / warp) ** 0.5)
         return given
 
     def _director(self) -> _Numbers:
@@ -102,8 +125,8 @@ class Fabric(NamedTuple):
             )
         return {**given, **changes}
 
-    def _checked(self, poisson: Any) -> Any:
-        """A field of moduli makes a field of them, which the material checks."""
+    def _check_poisson(self, poisson: Any) -> Any:
+        """Check a published number; where moduli are fields it is a field, which the material checks."""
         if isinstance(poisson, float) and not 0 < poisson < 0.5:
             raise InvalidInput(
                 f"preset {self.name!r}",
@@ -119,19 +142,19 @@ _TEXT = ("name", "fabric", "structure", "grade", "source", "note")
 
 @cache
 def load_fabrics() -> dict[str, Fabric]:
-    """All rows by name, in the order of the table."""
+    """Return all fabrics by name, in the order of the table."""
     text = resources.files("torchcloth.materials").joinpath("fabrics.csv").read_text(encoding="utf-8")
     _, *rows = csv.reader(text.splitlines())
-    found = {}
+    by_name = {}
     for row in rows:
         cells = zip(Fabric._fields, row, strict=True)
         values = {key: cell if key in _TEXT else float(cell) if cell else None for key, cell in cells}
-        found[row[0]] = Fabric(**values)  # type: ignore[arg-type]
-    return found
+        by_name[row[0]] = Fabric(**values)  # type: ignore[arg-type]
+    return by_name
 
 
 def find_fabric(name: str) -> Fabric:
-    """The fabric called ``name``.
+    """Return the fabric called ``name``.
 
     Raises:
         InvalidInput: no such fabric.
@@ -142,7 +165,7 @@ def find_fabric(name: str) -> Fabric:
 
 
 def format_table() -> str:
-    """The numbers of all fabrics as text, with their grade; sources by ``find(name).source``."""
+    """Format the numbers of all fabrics as text, with their grade; ``find_fabric(name).source`` has the source."""
     columns = {
         "kg/m2": "areal_density",
         "warp N/m": "membrane_warp",

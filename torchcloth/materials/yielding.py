@@ -1,4 +1,4 @@
-"""Plastic set in the plane of the sheet."""
+"""Plasticity in the plane of the sheet: permanent set."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ from .stretch import right_stretch
 
 
 class NormYield(nn.Module):
-    """Elastic stretches stay within sum (sigma_i - 1)^2 <= c^2; what goes beyond is a lasting set.
+    """Elastic stretches stay within sum (sigma_i - 1)^2 <= c^2; what exceeds it becomes permanent set.
 
     The DiffCP paper bounds |F - 1|, which a rigid rotation violates; this is its objective form. It acts on the right
-    stretch: the rotation is kept, the strain U - 1 is shortened to length c without turning, and the set is recorded in
-    the material's axes. Rate-independent: a strain held for longer sets no further. Shear counts as any strain, which
-    woven cloth would take back, and its yarns do not follow the set (as in ``RestShape``).
+    stretch: the rotation is unchanged, the strain U - 1 is shortened to length c without turning, and the set is stored
+    in the material's axes. The law is rate-independent: a strain that lasts longer sets no further. Shear counts as any
+    other strain, although woven cloth recovers from it, and yarns do not follow the set (as in ``RestShape``).
 
     Args:
         limit: c [-], the elastic strain that does not set; 0.02 is 2 % along one axis. Scalar or one per triangle.
@@ -31,11 +31,14 @@ class NormYield(nn.Module):
         self.limit = PhysicalParameter(limit, "-", name="yield limit")
 
     def initial_memory(self, triangles: int) -> Tensor:
-        """No set: the identity, by rows [E, 4]."""
+        """Return the identity by rows, [E, 4]: no set."""
         return torch.eye(2).flatten().expand(triangles, 4)
 
     def flow(self, limit: Tensor, trial: Surface, inverse_plastic: Tensor) -> Tensor:
-        """A -> A U^-1 (1 + c (U - 1) / |U - 1|) where |U - 1| > c, U the elastic stretch; [..., E, 4] by rows."""
+        """Return A U^-1 (1 + c (U - 1) / |U - 1|) where |U - 1| > c, else A; [..., E, 4] by rows.
+
+        U is the right stretch of ``trial``.
+        """
         u = right_stretch(trial)
         strain = torch.cat([u.warp - 1, u.shear, u.shear, u.weft - 1], dim=-1)
         length = safe_norm(strain)

@@ -11,7 +11,17 @@ from ..boundaries import AbstractBoundary, PrescribedMotion, sample_trajectory
 from ..meshes import Mesh, rectangle
 from ..types import Trajectory
 from . import samples
-from .contract import Contract, batch_parameters, call_with, require_close, require, require_finite_gradients, float64, detached_parameters, unbatch_parameters
+from .contract import (
+    Contract,
+    batch_parameters,
+    call_with,
+    detached_parameters,
+    float64,
+    require,
+    require_close,
+    require_finite_gradients,
+    unbatch_parameters,
+)
 from .finite_differences import check_gradients
 
 
@@ -153,7 +163,7 @@ class GraspContract(BoundaryContract):
 
     def test_is_driven(self) -> None:
         """Without a trajectory the layer must refuse to run."""
-        require(type(self._boundary()).is_prescribed, "a grasp must declare driven = True")
+        require(type(self._boundary()).is_prescribed, "a grasp must declare is_prescribed = True")
 
     def test_held_vertices_follow_the_pose_exactly(self) -> None:
         """No drift over many substeps, whatever the rest of the cloth does."""
@@ -173,7 +183,10 @@ class GraspContract(BoundaryContract):
         """While it is closed, and nothing while it is open."""
         boundary, pose = self._boundary(), self._pose()
         index = boundary.prescribed_vertices(self._drive(pose), 0)
-        require(index is not None and sorted(index.tolist()) == sorted(self.gripped_vertices()), "held() names other vertices")
+        require(
+            index is not None and sorted(index.tolist()) == sorted(self.gripped_vertices()),
+            "prescribed_vertices() names other vertices",
+        )
         require(boundary.prescribed_vertices(self._drive(pose, False), 0) is None, "an open gripper says that it holds")
 
     def test_an_open_gripper_lets_go(self) -> None:

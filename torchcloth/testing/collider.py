@@ -12,7 +12,7 @@ from .._utils.linalg import cross, dot
 from ..boundaries import AbstractCollider
 from . import samples
 from .boundary import BoundaryContract
-from .contract import require_close, require, require_finite_gradients, float64
+from .contract import float64, require, require_close, require_finite_gradients
 
 
 class ColliderContract(BoundaryContract):
@@ -128,7 +128,9 @@ class ColliderContract(BoundaryContract):
         taken = (change - push * normal).norm(dim=-1, keepdim=True)
         require((push > 0).any() and mu > 0, "nothing touches, or without friction")
         require((push >= 0).all() and (taken <= mu * push + 1e-9).all(), "outside the friction cone")
-        require((cross(left, slip).norm(dim=-1) <= 1e-9).all() and (dot(left, slip) >= -1e-9).all(), "slip is deflected")
+        require(
+            (cross(left, slip).norm(dim=-1) <= 1e-9).all() and (dot(left, slip) >= -1e-9).all(), "slip is deflected"
+        )
         slides = left.norm(dim=-1, keepdim=True) > 1e-6
         require((slides & (push > 0)).any(), "nothing slides")
         require_close(taken[slides], mu * push[slides], 1e-9, "sliding friction is not mu times the push")
@@ -158,7 +160,7 @@ class ColliderContract(BoundaryContract):
         world = x @ start[:3, :3].mT + start[:3, 3]
         carried = (world @ step[:3, :3].mT + step[:3, 3] - world) / self.dt
         moving = self._body(moving=True)
-        require(moving.is_prescribed, "a moving collider must declare driven = True")
+        require(moving.is_prescribed, "a moving collider must declare is_prescribed = True")
         got = moving.constrain(world, v @ turn.mT + carried, self.dt, motion, k).detach()
         fixed = self._body(moving=False).constrain(x, v, self.dt, None, k).detach()
         require_close(got, fixed @ turn.mT + carried, 1e-9, "a moving body answers differently from a fixed one")

@@ -16,7 +16,17 @@ from ..materials import AEP
 from ..meshes import Mesh, rectangle
 from ..types import ClothState, EffectInputs, Trajectory
 from . import samples
-from .contract import Contract, batch_parameters, call_with, require_close, require, require_finite_gradients, float64, detached_parameters, unbatch_parameters
+from .contract import (
+    Contract,
+    batch_parameters,
+    call_with,
+    detached_parameters,
+    float64,
+    require,
+    require_close,
+    require_finite_gradients,
+    unbatch_parameters,
+)
 from .finite_differences import check_gradients
 
 
@@ -187,7 +197,7 @@ class EffectContract(Contract):
         for name, bound, jacobian in pairs:
             largest = float(torch.linalg.eigvals(self._rates(effect, jacobian)).real.max())
             allowed = float(bound.detach()) * (1 + 1e-9) + 1e-9
-            require(largest <= allowed, f"rates() bounds the {name} by {allowed:.4g}, it is {largest:.4g}")
+            require(largest <= allowed, f"stability_bounds() bounds the {name} by {allowed:.4g}, it is {largest:.4g}")
 
     def test_viscous_is_the_part_of_the_force_that_it_says(self) -> None:
         """It may act in stages: linear in velocity, symmetric, never driving, within its rate; so is what is left."""
@@ -196,14 +206,17 @@ class EffectContract(Contract):
         once, twice = (self._viscous(effect, x, factor * v).detach() for factor in (1.0, 2.0))
         require_close(twice, 2 * once, 1e-12, "viscous() is not linear in velocity")
         mass, c = self._cloth({}).build_model().mass.detach(), effect.coefficients()
-        whole, rate = (float(value.detach()) for value in (effect.stability_bounds(c, mass)[1], effect.viscous_stability_bound(c, mass)))
+        whole, rate = (
+            float(value.detach())
+            for value in (effect.stability_bounds(c, mass)[1], effect.viscous_stability_bound(c, mass))
+        )
         matrix = self._rates(effect, self._thickness)
         require_close(matrix, matrix.mT, 1e-9, "viscous() is not symmetric")
         slowest, fastest = torch.linalg.eigvalsh(matrix)[[0, -1]].tolist()
         require(slowest >= -1e-9 * max(1.0, fastest), "viscous() drives some motion")
         require(fastest <= rate * (1 + 1e-9) + 1e-9, f"viscous_stability_bound() says {rate:.4g}, it is {fastest:.4g}")
         largest = float(torch.linalg.eigvals(self._rates(effect, self._damping) - matrix).real.max())
-        require(largest <= whole * (1 + 1e-9) - rate + 1e-9, "rates() must bound what is not viscous by the difference")
+        require(largest <= whole * (1 + 1e-9) - rate + 1e-9, "stability_bounds() must bound what is not viscous by the difference")
 
     def _rates(self, effect: AbstractEffect, jacobian: Callable[..., Tensor]) -> Tensor:
         """Minus a force's derivative at rest, over the roots of the masses on both sides."""

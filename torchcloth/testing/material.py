@@ -11,7 +11,17 @@ from torch import Tensor
 
 from ..materials import AbstractMaterial
 from . import samples
-from .contract import Contract, batch_parameters, call_with, require_close, require, require_finite_gradients, float64, detached_parameters, unbatch_parameters
+from .contract import (
+    Contract,
+    batch_parameters,
+    call_with,
+    detached_parameters,
+    float64,
+    require,
+    require_close,
+    require_finite_gradients,
+    unbatch_parameters,
+)
 from .finite_differences import check_gradients, finite_difference_sweep
 
 
@@ -214,8 +224,12 @@ class MaterialContract(Contract):
             states = [torch.einsum("b,...->b...", factor, value) for value in inputs.values()]
             together = call_with(material, many, law, *states)
             for k in range(3):
-                alone = call_with(material, unbatch_parameters(many, parameters, k), law, *(value[k] for value in states))
-                require_close(together[k].detach(), alone.detach(), 1e-12, f"{name}: batch entry {k} differs from the loop")
+                alone = call_with(
+                    material, unbatch_parameters(many, parameters, k), law, *(value[k] for value in states)
+                )
+                require_close(
+                    together[k].detach(), alone.detach(), 1e-12, f"{name}: batch entry {k} differs from the loop"
+                )
 
     def test_works_in_float32(self) -> None:
         """Same values to single precision, and no silent promotion."""
