@@ -10,7 +10,7 @@ import torch
 from helpers import sheet_episodes
 
 from torchcloth.cli import main
-from torchcloth.diagnosis import Hypothesis, base_model, register_file, prepare_data
+from torchcloth.diagnosis import Hypothesis, build_base_model, prepare_data, register_file
 from torchcloth.diagnosis.causes import hypotheses, user_hypotheses
 from torchcloth.errors import InvalidInput
 
@@ -25,7 +25,7 @@ register(Hypothesis("my.damping", "1/s", {typical}, lambda w, a: w.with_cloth({{
 @pytest.fixture
 def file(tmp_path):
     yield tmp_path / "mine.py"
-    hypotheses.forget("my.damping")
+    hypotheses.unregister("my.damping")
     user_hypotheses._files.clear()
 
 
@@ -33,12 +33,12 @@ def test_a_file_registers_and_what_depends_on_it_knows_its_content(file):
     file.write_text(FILE.format(typical=2.0))
     (found,) = register_file(file)
     assert (found.name, found.typical) == ("my.damping", 2.0)
-    assert "my.damping" in {h.name for h in hypotheses.known()}
-    before = user_hypotheses.digests()
+    assert "my.damping" in {h.name for h in hypotheses.list_known_hypotheses()}
+    before = user_hypotheses.digest_user_files()
     file.write_text(FILE.format(typical=3.0))
     assert [h.typical for h in register_file(file)] == [3.0]
-    assert user_hypotheses.digests() != before
-    assert len(user_hypotheses.digests()) == 1
+    assert user_hypotheses.digest_user_files() != before
+    assert len(user_hypotheses.digest_user_files()) == 1
 
 
 def test_what_the_file_imports_counts_as_well_and_it_may_be_run_again(file):
@@ -49,13 +49,13 @@ def test_what_the_file_imports_counts_as_well_and_it_may_be_run_again(file):
         "from torchcloth.diagnosis import register\nfrom my_helper_of_causes import CAUSE\nregister(CAUSE)\n"
     )
     path = list(sys.path)
-    first, before = register_file(file), user_hypotheses.digests()
+    first, before = register_file(file), user_hypotheses.digest_user_files()
     assert sys.path == path
     assert register_file(file) == first
-    assert user_hypotheses.digests() == before
+    assert user_hypotheses.digest_user_files() == before
     helper.write_text(helper.read_text() + "# another law\n")
     register_file(file)
-    assert user_hypotheses.digests() != before
+    assert user_hypotheses.digest_user_files() != before
 
 
 @pytest.mark.parametrize(
@@ -105,24 +105,26 @@ def test_kin_may_be_a_list():
 )
 def test_causes_that_a_search_could_not_use_are_refused(change, said):
     given = {"name": "my.damping", "unit": "1/s", "typical": 2.0, "apply": lambda world, _: world} | change
-    before = hypotheses.known()
+    before = hypotheses.list_known_hypotheses()
     with pytest.raises(InvalidInput, match=said):
         hypotheses.register(Hypothesis(**given))
-    assert hypotheses.known() == before
+    assert hypotheses.list_known_hypotheses() == before
 
 
 def test_the_example_of_the_docs_is_one(file):
-    page = (Path(__file__).parents[2] / "docs" / "explanation" / "diagnosis.md").read_text(encoding="utf-8")
-    layer, example, whole = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
-    for text in (layer, whole):
-        compile(text, "docs/explanation/diagnosis.md", "exec")
+    page = (Path(__file__).parents[2] / "docs" / "how-to" / "diagnose.md").read_text(encoding="utf-8")
+    for text in re.findall(r"```py\n(.*?)```", page, re.DOTALL):
+        compile(text, "docs/how-to/diagnose.md", "exec")
+    (example,) = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
     file.write_text(example)
     (travel,) = register_file(file)
-    hypotheses.forget(travel.name)
+    hypotheses.unregister(travel.name)
     recording = sheet_episodes.episode()
-    model = base_model(recording)
+    model = build_base_model(recording)
     (episode,) = prepare_data(model, [recording]).episodes
-    before, after = (model.world([(travel, a)]).driven(episode).motion["left"].pose[:, :3, 3] for a in (0.0, 0.1))
+    before, after = (
+        model.build_world([(travel, a)]).apply_motion(episode).motion["left"].pose[:, :3, 3] for a in (0.0, 0.1)
+    )
     way = before - before[0]
     assert float(way.abs().max()) > 0.01
     torch.testing.assert_close(after - after[0], 1.1 * way)

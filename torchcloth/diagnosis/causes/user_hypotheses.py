@@ -27,7 +27,7 @@ def register_file(path: str | Path) -> list[Hypothesis]:
     """
     path = Path(path)
     if not path.is_file():
-        remedy = "correct the path; docs/explanation/diagnosis.md has an example"
+        remedy = "correct the path; docs/how-to/diagnose.md has an example"
         raise InvalidInput("causes", got=f"no file {path}", expected=EXPECTED_FILE, remedy=remedy)
     before, folder = set(sys.modules), str(path.resolve().parent)
     sys.path.insert(0, folder)  # as Python does for a script
