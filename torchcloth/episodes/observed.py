@@ -1,8 +1,8 @@
-"""Recordings as the simulator takes them: a cloth with its boundaries, motion, frame times, what was seen and felt."""
+"""Recorded episodes as tensors: a cloth with its boundaries, its motion, frame times, points, markers and forces."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -10,33 +10,39 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from .._utils.linalg import EXACT, last_knot
+from .._utils.linalg import EXACT_CDIST_MODE, find_last_knot
 from ..boundaries import Grasp, Plane
-from ..boundaries.motion import interpolate
+from ..boundaries.motion import interpolate_poses
 from ..cloth import Cloth
 from ..dynamics.contact import Contact
 from ..effects import AbstractEffect, AirDrag, Bending, Gravity
 from ..errors import InvalidInput, RecordingError
-from ..losses import Hits
+from ..losses import ClosestPoints
 from ..materials import AEP, AbstractMaterial
 from ..meshes import Mesh, rectangle
 from ..meshes.patches import Patch
 from ..recordings import Camera, Recording
-from ..recordings.scene import FRICTION, THICKNESS
-from ..robots import closing, replay  # pyright: ignore[reportMissingImports] - mapped from robots/ at installation
-from ..simulation.argument_checks import NAME, is_name
+from ..recordings.consistency import as_list, check_same_cloth, merge_scene
+from ..recordings.fingerprints import reject_duplicates
+from ..recordings.scene import DEFAULT_TABLE_FRICTION, DEFAULT_THICKNESS_M
+from ..recordings.size_checks import check_size
+from ..robots import list_closing_grippers, replay  # pyright: ignore[reportMissingImports] - mapped from robots/ at installation
+from ..simulation.argument_checks import EXPECTED_PART_NAME, is_name
 from ..types import Trajectory
 from . import streams
-from .pattern_interpolation import between, carried, with_patches
+from .pattern_interpolation import interpolate_on_pattern, interpolation_weights, move_vertices_to_patches
 
-DEFAULT_STIFFNESS = 300.0  # N/m, a start in the middle of the published fabrics, where an episode names none
-DEFAULT_POISSON = 0.2
-SHEET_TRIANGLES = 288
-RATE = 20.0  # Hz, of frames that nobody has seen
-ELSEWHERE = 0.15  # of the cloth's diagonal, that what is seen first lies from it
-SAME = 1e-6  # m, on the pattern: one place
-FEW = 0.1  # force readings per frame, that may be left out without a word
-FARTHEST = 0.2  # m, of a held patch from its gripper's origin at the first frame
+DEFAULT_MEMBRANE_STIFFNESS_N_PER_M = 300.0  # middle of the published fabrics, where an episode names none
+DEFAULT_POISSON_RATIO = 0.2
+DEFAULT_SHEET_TRIANGLES = 288
+DEFAULT_FRAME_RATE_HZ = 20.0  # of episodes without measurements
+MIN_FRAMES_OF_PART = 4  # of the beginning of an episode
+MAX_FIRST_CLOUD_OFFSET_FRACTION = 0.15  # median distance of the first cloud from the cloth, in the cloth's diagonals
+MAX_SILENTLY_DROPPED_READINGS_PER_FRAME = 0.1  # force readings after the last frame, above which there is a warning
+SAME_PATTERN_PLACE_M = 1e-6  # distance on the pattern within which two places are one
+MAX_PATCH_TO_GRIPPER_M = 0.2  # distance of a held patch from its gripper's origin at the first frame
+TIME_TOLERANCE_S = 1e-6  # by which a frame may lie outside of the motion
+TIME_AFTER_KNOT_S = 1e-9  # added to a time, so that a knot at that time counts as passed
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,22 +50,23 @@ class Episode:
     """One recording, as tensors.
 
     Attributes:
-        name: how messages and pictures call it.
+        name: in messages and pictures.
         motion: grippers' trajectories by name.
         times: [T] s, frame times on the motion's clock.
-        clouds: T tensors [N_t, 3] m, empty where none was seen.
+        clouds: T tensors [N_t, 3] m, empty where there are no points.
         initial: [V, 3] m, vertex positions at the first frame.
-        settles: whether ``initial`` was measured, so that its noise is damped out before the first frame.
-        noise: standard deviation of one point [m], or None when unknown.
-        markers: [T, M, 3] m, material points, NaN where unseen; or None.
-        places: where the markers are on the mesh.
-        wrenches: gripper -> [T, 6] N, N m, what the cloth exerts on it about its origin: mean over the interval that
-            ends at the frame, NaN where not measured.
-        unseen: frames at the end that are simulated and not observed.
-        eye: [3] m, where the camera stands; None where there is none, or more than one.
-        dropped: frames after the motion's end, which are not simulated.
-        unused: force readings after the last frame of what was seen, which are not simulated either.
-        idle: grippers that close and hold nothing: the cloth has no grasp of their name.
+        needs_settling: whether ``initial`` was measured, so that its noise is damped out before the first frame.
+        noise_std: standard deviation of one point [m], or None when unknown.
+        markers: [T, M, 3] m, material points, NaN where hidden; or None.
+        marker_places: where the markers are on the mesh.
+        wrenches: gripper -> [T, 6] N, N m, exerted by the cloth on the gripper about its origin: mean over the interval
+            that ends at the frame, NaN where not measured.
+        unobserved_count: number of frames at the end that are simulated and not observed.
+        camera_position: [3] m; None without a camera, or with more than one.
+        frames_after_motion: number of frames after the motion's end, which are not simulated.
+        readings_after_last_frame: number of force readings after the last frame with points or markers, which are not
+            simulated either.
+        idle_grippers: names of grippers that close and hold nothing: the cloth has no grasp of their name.
     """
 
     name: str
@@ -67,125 +74,154 @@ class Episode:
     times: Tensor
     clouds: list[Tensor]
     initial: Tensor
-    settles: bool
-    noise: float | None
+    needs_settling: bool
+    noise_std: float | None
     markers: Tensor | None = None
-    places: Hits | None = None
+    marker_places: ClosestPoints | None = None
     wrenches: Mapping[str, Tensor] = field(default_factory=dict)
-    unseen: int = 0
-    eye: Tensor | None = None
-    dropped: int = 0
-    unused: int = 0
-    idle: tuple[str, ...] = ()
+    unobserved_count: int = 0
+    camera_position: Tensor | None = None
+    frames_after_motion: int = 0
+    readings_after_last_frame: int = 0
+    idle_grippers: tuple[str, ...] = ()
 
-    def identity(self) -> list[object]:
-        """What simulations of it, and what is seen of them, depend on."""
-        seen = [self.times, self.initial, self.settles, *self.clouds, self.markers, *(self.places or ()), self.noise]
-        moved = [part for name, m in self.motion.items() for part in (name, m.t, m.pose, m.closed)]
-        return [*seen, self.eye, *moved, *(part for pair in self.wrenches.items() for part in pair)]
+    def fingerprint_parts(self) -> list[object]:
+        """List everything that simulations of it, and their comparison with the data, depend on."""
+        data = [
+            self.times,
+            self.initial,
+            self.needs_settling,
+            *self.clouds,
+            self.markers,
+            *(self.marker_places or ()),
+            self.noise_std,
+        ]
+        motion = [part for name, m in self.motion.items() for part in (name, m.t, m.pose, m.closed)]
+        return [*data, self.camera_position, *motion, *(part for pair in self.wrenches.items() for part in pair)]
 
     @property
-    def observed(self) -> int:
-        """Frames of which there may be data."""
-        return len(self.times) - self.unseen
+    def observed_count(self) -> int:
+        """Number of frames that may have data."""
+        return len(self.times) - self.unobserved_count
 
     @property
     def lookahead(self) -> float:
-        """s, of frames that are simulated after the last observed one."""
-        return float(self.times[-1] - self.times[self.observed - 1])
+        """Duration of the frames that are simulated after the last observed one [s]."""
+        return float(self.times[-1] - self.times[self.observed_count - 1])
 
-    def doubts(self) -> list[str]:
-        """What a reader should know of it, in sentences."""
-        out = []
-        if self.dropped:
-            out.append(
-                f"{self.name}: {self.dropped} of {self.observed + self.dropped} frames come after the motion's end and "
-                "were left out: record the motion as long, or check clock_offset"
+    def data_warnings(self) -> list[str]:
+        """List what a reader should know of the data, in sentences."""
+        warnings = []
+        if self.frames_after_motion:
+            count = self.observed_count + self.frames_after_motion
+            warnings.append(
+                f"{self.name}: {self.frames_after_motion} of {count} frames come after the motion's end and were left "
+                "out: record the motion as long, or check clock_offset"
             )
-        if self.unused > FEW * self.observed:
-            out.append(
-                f"{self.name}: {self.unused} force readings come after the last frame that was seen and were left out: "
-                "leave points and markers out of the recording to use forces alone"
+        if self.readings_after_last_frame > MAX_SILENTLY_DROPPED_READINGS_PER_FRAME * self.observed_count:
+            warnings.append(
+                f"{self.name}: {self.readings_after_last_frame} force readings come after the last frame with points "
+                "or markers and were left out: leave points and markers out of the recording to use forces alone"
             )
         if self.motion and not any(bool(m.closed.any()) for m in self.motion.values()):
-            out.append(f"{self.name}: no gripper is ever closed: the cloth was simulated as let go")
-        if self.idle:
-            names = ", ".join(self.idle)
-            out.append(f"{self.name}: no grasp is called {names}: the cloth was simulated as not held by it")
-        if self._is_elsewhere():
-            place = ", ".join(f"{1e3 * x:+.0f}" for x in (self.clouds[0].mean(0) - self.initial.mean(0)).tolist())
-            out.append(
-                f"{self.name}: what was seen first lies ({place}) mm from the cloth: check T_world_camera, the grasps' "
-                "poses and initial_vertices"
+            warnings.append(f"{self.name}: no gripper is ever closed: the cloth was simulated as let go")
+        if self.idle_grippers:
+            names = ", ".join(self.idle_grippers)
+            warnings.append(f"{self.name}: no grasp is called {names}: the cloth was simulated as not held by it")
+        if self._is_far_from_first_cloud():
+            offset = (self.clouds[0].mean(0) - self.initial.mean(0)).tolist()
+            text = ", ".join(f"{1e3 * x:+.0f}" for x in offset)
+            warnings.append(
+                f"{self.name}: the points of the first frame lie ({text}) mm from the cloth: check T_world_camera, the "
+                "grasps' poses and initial_vertices"
             )
-        return out
+        return warnings
 
-    def _is_elsewhere(self) -> bool:
-        """Whether the points of the first frame are far from the cloth, most of them."""
+    def _is_far_from_first_cloud(self) -> bool:
+        """Whether most points of the first frame are far from the cloth."""
         if not self.clouds or not len(self.clouds[0]):
             return False
-        distance = torch.cdist(self.clouds[0], self.initial, compute_mode=EXACT).amin(1)
-        return float(distance.median()) > ELSEWHERE * float((self.initial.amax(0) - self.initial.amin(0)).norm())
+        distance = torch.cdist(self.clouds[0], self.initial, compute_mode=EXACT_CDIST_MODE).amin(1)
+        diagonal = float((self.initial.amax(0) - self.initial.amin(0)).norm())
+        return float(distance.median()) > MAX_FIRST_CLOUD_OFFSET_FRACTION * diagonal
 
-    def beyond(self, reach: float) -> Episode:
-        """With frames after the last, for ``reach`` [s] or as long as the motion goes on: a late clock sees them."""
+    def with_lookahead(self, duration: float) -> Episode:
+        """Add frames after the last one, for ``duration`` [s] or until the motion ends: a late clock sees them."""
         step = float(self.times.diff().median())
         end = min((float(m.t[-1]) for m in self.motion.values()), default=torch.inf)
-        last = min(float(self.times[-1]) + reach, end)
-        more = torch.arange(1, 1 + int((last - float(self.times[-1])) / step + 1e-6), dtype=self.times.dtype)
-        times = torch.cat([self.times, self.times[-1] + step * more])
-        if last - float(times[-1]) > streams.SAME:
+        last = min(float(self.times[-1]) + duration, end)
+        steps = torch.arange(1, 1 + int((last - float(self.times[-1])) / step + 1e-6), dtype=self.times.dtype)
+        times = torch.cat([self.times, self.times[-1] + step * steps])
+        if last - float(times[-1]) > streams.SAME_TIME_S:
             times = torch.cat([times, times.new_tensor([last])])
         extra = len(times) - len(self.times)
 
-        def padded(data: Tensor) -> Tensor:
+        def pad(data: Tensor) -> Tensor:
             return torch.cat([data, data.new_full((extra, *data.shape[1:]), torch.nan)])
 
         return replace(
             self,
             times=times,
             clouds=[*self.clouds, *(self.initial.new_zeros(0, 3) for _ in range(extra))],
-            markers=None if self.markers is None else padded(self.markers),
-            wrenches={name: padded(wrench) for name, wrench in self.wrenches.items()},
-            unseen=self.unseen + extra,
+            markers=None if self.markers is None else pad(self.markers),
+            wrenches={name: pad(wrench) for name, wrench in self.wrenches.items()},
+            unobserved_count=self.unobserved_count + extra,
         )
 
-    def unseen_after(self, end: float) -> Episode:
-        """Without what was seen later than ``end`` [s]; what was felt stays."""
-        late = self.times > end + streams.SAME
+    def without_observations_after(self, end: float) -> Episode:
+        """Remove points and markers later than ``end`` [s]; forces stay."""
+        is_late = self.times > end + streams.SAME_TIME_S
         markers = self.markers
         if markers is not None:
-            markers = markers.where(~late[:, None, None], torch.nan)
-        clouds = [c[:0] if gone else c for c, gone in zip(self.clouds, late.tolist(), strict=True)]
+            markers = markers.where(~is_late[:, None, None], torch.nan)
+        clouds = [c[:0] if late else c for c, late in zip(self.clouds, is_late.tolist(), strict=True)]
         return replace(self, clouds=clouds, markers=markers)
 
-    def until(self, share: float) -> Episode:
-        """The first ``share`` of the frames, at least four."""
-        count = min(self.observed, max(4, round(share * self.observed)))
+    def first_fraction(self, fraction: float) -> Episode:
+        """Return the first ``fraction`` of the frames, at least four."""
+        count = min(self.observed_count, max(MIN_FRAMES_OF_PART, round(fraction * self.observed_count)))
         return replace(
             self,
             times=self.times[:count],
             clouds=self.clouds[:count],
             markers=None if self.markers is None else self.markers[:count],
             wrenches={name: wrench[:count] for name, wrench in self.wrenches.items()},
-            unseen=0,
+            unobserved_count=0,
         )
 
-    def positions(self, frame: int) -> Tensor:
-        """[N, 3] m, all that was seen of the cloth: its cloud; its markers where it has no cloud at all."""
+    def observed_points(self, frame: int) -> Tensor:
+        """Return the cloud [N, 3] m of a frame, or its visible markers where the episode has no cloud at all."""
         if self.markers is None or any(len(cloud) for cloud in self.clouds):
             return self.clouds[frame]
-        seen = self.markers[frame]
-        return seen[seen.isfinite().all(-1)]
+        markers = self.markers[frame]
+        return markers[markers.isfinite().all(-1)]
 
 
-def cloth_from(
+def check_recordings(recordings: Recording | Sequence[Recording]) -> list[Recording]:
+    """Check that recordings can be fitted together, and return them as a list.
+
+    Raises:
+        InvalidInput: none, one twice, different cloths or tables, or something that is no recording.
+        RecordingError: one that is in another unit than metres.
+    """
+    checked = as_list(recordings)
+    if not checked:
+        raise InvalidInput("recordings", got="none", expected="at least one episode")
+    check_same_cloth(checked)
+    reject_duplicates(checked)
+    for recording in checked:
+        check_size(recording)
+    merge_scene(checked)  # tables that contradict each other are refused now, and not with the result
+    return checked
+
+
+def build_cloth(
     recording: Recording,
     material: AbstractMaterial | None = None,
     effects: Mapping[str, AbstractEffect] | None = None,
     contact: Contact | None = None,
 ) -> Cloth:
-    """The cloth that an episode describes, with its grasps and colliders.
+    """Build the cloth that an episode describes, with its grasps and colliders.
 
     Args:
         recording: names mesh or sheet, density, grasps, colliders, gravity, air.
@@ -197,9 +233,9 @@ def cloth_from(
         RecordingError: the episode has neither mesh nor sheet.
         InvalidInput: parts that do not fit each other.
     """
-    mesh = mesh_of(recording)
+    mesh = build_mesh(recording)
     if effects is None:
-        effects = effects_of(recording)
+        effects = build_effects(recording)
     if both := recording.colliders.keys() & recording.grasps.keys():
         raise InvalidInput(
             f"{recording.path}: names", got=f"a grasp and a collider {min(both)!r}", expected="a name for each"
@@ -209,44 +245,43 @@ def cloth_from(
             raise RecordingError(
                 f"{recording.path}: name of a grasp or collider",
                 got=repr(name),
-                expected=NAME,
+                expected=EXPECTED_PART_NAME,
                 remedy="rename it in episode.json and motion.npz",
             )
     boundaries = {}
     for name, collider in recording.colliders.items():
-        friction = FRICTION if collider.friction is None else collider.friction
+        friction = DEFAULT_TABLE_FRICTION if collider.friction is None else collider.friction
         boundaries[name] = Plane(collider.point.tolist(), collider.normal.tolist(), friction)
     for name, grasp in recording.grasps.items():
-        held = None if grasp.vertices is None else grasp.vertices.tolist()
-        boundaries[name] = Grasp(held) if grasp.uv is None else Grasp(uv=grasp.uv, radius=grasp.radius)
+        vertices = None if grasp.vertices is None else grasp.vertices.tolist()
+        boundaries[name] = Grasp(vertices) if grasp.uv is None else Grasp(uv=grasp.uv, radius=grasp.radius)
     density = recording.cloth.areal_density
-    return Cloth(mesh, material or material_of(recording), density, effects, boundaries, contact)
+    return Cloth(mesh, material or build_material(recording), density, effects, boundaries, contact)
 
 
-def mesh_of(recording: Recording) -> Mesh:
-    """The episode's rest mesh, or its rectangular sheet, its vertices moved to where patches end that have a radius.
+def build_mesh(recording: Recording) -> Mesh:
+    """Build the episode's rest mesh or rectangular sheet, with vertices at the edges of patches that have a radius.
 
     Raises:
-        RecordingError: neither is given.
+        RecordingError: neither mesh nor sheet is given.
     """
-    mesh = _mesh_as_said(recording)
-    patches = [Patch(np.atleast_2d(g.uv), g.radius) for g in recording.grasps.values() if g.uv is not None]
-    return with_patches(mesh, patches)
-
-
-def _mesh_as_said(recording: Recording) -> Mesh:
     cloth = recording.cloth
     if cloth.vertices is not None and cloth.faces is not None:
-        return Mesh.build(cloth.vertices, cloth.faces, cloth.uv)
-    if cloth.sheet is not None:
-        return rectangle(*cloth.sheet, triangles=SHEET_TRIANGLES)
-    raise RecordingError(
-        f"{recording.path}: cloth", got="neither mesh nor sheet", expected="cloth.mesh or cloth.sheet in episode.json"
-    )
+        mesh = Mesh.build(cloth.vertices, cloth.faces, cloth.uv)
+    elif cloth.sheet is not None:
+        mesh = rectangle(*cloth.sheet, triangles=DEFAULT_SHEET_TRIANGLES)
+    else:
+        raise RecordingError(
+            f"{recording.path}: cloth",
+            got="neither mesh nor sheet",
+            expected="cloth.mesh or cloth.sheet in episode.json",
+        )
+    patches = [Patch(np.atleast_2d(g.uv), g.radius) for g in recording.grasps.values() if g.uv is not None]
+    return move_vertices_to_patches(mesh, patches)
 
 
-def on_cpu(cloth: Cloth) -> None:
-    """Episodes are read into memory that the fused engine works on.
+def require_cpu(cloth: Cloth) -> None:
+    """Check that a cloth is on the CPU: episodes are read into memory that the fused engine works on.
 
     Raises:
         InvalidInput: the cloth is on another device.
@@ -255,104 +290,105 @@ def on_cpu(cloth: Cloth) -> None:
         raise InvalidInput("cloth", got=f"on {device}", expected="a cloth on the CPU", remedy="cloth.cpu()")
 
 
-def episode(cloth: Cloth, recording: Recording, rate: float | None = None) -> Episode:
+def build_episode(cloth: Cloth, recording: Recording, rate: float | None = None) -> Episode:
     """Check a recording against a cloth and turn it into tensors of the cloth's dtype.
 
     Args:
         cloth: with a grasp for each gripper that holds it.
-        recording: what was recorded.
-        rate: Hz, of frames along the motion of one in which nothing was seen or felt; None refuses it.
+        recording: of the cloth.
+        rate: frame rate along the motion of an episode without measurements [Hz]; None refuses such an episode.
 
     Raises:
-        RecordingError: nothing was seen or felt, or no motion for one of the cloth's grasps.
+        RecordingError: no measurements, or no motion for one of the cloth's grasps.
         InvalidInput: initial vertices that do not belong to the cloth's mesh.
     """
-    recording = streams.without_doubles(recording)
+    recording = streams.drop_duplicate_markers(recording)
     name = recording.path.name if recording.path else "recording"
     dtype = cloth.state(torch.as_tensor(cloth.mesh.vertices)).x.dtype
-    needed = [key for key, boundary in cloth.boundaries.items() if boundary.driven]
-    motion = replay(recording, dtype, needed)
-    missing = [key for key in needed if key not in motion]
+    grasps = [key for key, boundary in cloth.boundaries.items() if boundary.is_prescribed]
+    motion = replay(recording, dtype, grasps)
+    missing = [key for key in grasps if key not in motion]
     if missing:
         got = f"motion of {sorted({*recording.grippers, *recording.joints})}"
         raise RecordingError(f"{name}: no motion for grasp {missing[0]!r}", got=got)
-    times, dropped = _frame_times(name, recording, motion, needed, rate)
-    initial = first_shape(name, cloth, recording).to(dtype)
-    _check_place(name, cloth, motion, initial, times[0])
-    markers = streams.markers(recording, times, dtype)
-    felt = streams.felt(recording, needed)
+    times, frames_after_motion = _frame_times(name, recording, motion, grasps, rate)
+    initial = compute_initial_vertices(name, cloth, recording).to(dtype)
+    _check_gripper_distance(name, cloth, motion, initial, times[0])
+    markers = streams.gather_markers(recording, times, dtype)
+    camera, uv = find_depth_camera(recording), None if recording.markers is None else recording.markers.uv
+    is_late_reading = streams.find_force_times(recording, grasps) > times[-1] + float(np.diff(times).max())
     return Episode(
         name=name,
-        motion={key: motion[key] for key in needed},
+        motion={key: motion[key] for key in grasps},
         times=torch.as_tensor(times),
-        clouds=streams.clouds(recording, times, dtype),
+        clouds=streams.gather_clouds(recording, times, dtype),
         initial=initial,
-        settles=recording.cloth.initial_vertices is not None,
-        noise=recording.observation_noise_std,
+        needs_settling=recording.cloth.initial_vertices is not None,
+        noise_std=recording.observation_noise_std,
         markers=markers,
-        places=None if markers is None else streams.on_pattern(cloth.mesh, recording.markers.uv),  # type: ignore
-        wrenches=streams.wrenches(recording, needed, times, dtype),
-        eye=_eye(recording, dtype),
-        dropped=dropped,
-        idle=tuple(key for key in closing(recording) if key not in needed),
-        unused=int((felt > times[-1] + float(np.diff(times).max())).sum()),
+        marker_places=None if markers is None or uv is None else streams.locate_on_pattern(cloth.mesh, uv),
+        wrenches=streams.average_wrenches(recording, grasps, times, dtype),
+        camera_position=None if camera is None else torch.as_tensor(camera.T_world_camera[:3, 3], dtype=dtype),
+        frames_after_motion=frames_after_motion,
+        idle_grippers=tuple(key for key in list_closing_grippers(recording) if key not in grasps),
+        readings_after_last_frame=int(is_late_reading.sum()),
     )
 
 
-def _eye(recording: Recording, dtype: torch.dtype) -> Tensor | None:
-    camera = eye_of(recording)
-    return None if camera is None else torch.as_tensor(camera.T_world_camera[:3, 3], dtype=dtype)
-
-
-def eye_of(recording: Recording) -> Camera | None:
-    """The camera that sees how far away things are, where there is one: of several, the one with depth."""
+def find_depth_camera(recording: Recording) -> Camera | None:
+    """Return the camera that measures depth; of a single camera, that one; None if there is no such choice."""
     cameras = list(recording.cameras.values())
-    deep = [c for c in cameras if c.depth is not None or c.depth_scale is not None]
-    found = deep or cameras
-    return found[0] if len(found) == 1 else None
+    with_depth = [c for c in cameras if c.depth is not None or c.depth_scale is not None]
+    candidates = with_depth or cameras
+    return candidates[0] if len(candidates) == 1 else None
 
 
 def _frame_times(
-    name: str, recording: Recording, motion: Mapping[str, Trajectory], needed: list[str], rate: float | None
+    name: str, recording: Recording, motion: Mapping[str, Trajectory], grasps: list[str], rate: float | None
 ) -> tuple[np.ndarray, int]:
-    """(times, number of frames after the motion's end, left out) of points and markers, else of force readings.
+    """(times, number of frames that come after the motion's end and are left out).
 
-    Where there are neither, all along the motion at ``rate`` [Hz].
-
-    The first frame is the points' where there are points.
+    The times are those of points and markers, from the first frame of the points on. Without these they are times of
+    force readings, and without any measurement those of frames at ``rate`` [Hz] along the motion.
     """
-    seen = [s.t + recording.clock_offset for s in (recording.points, recording.markers) if s is not None]
-    if not seen:
-        felt = streams.felt(recording, needed)
-        begin = max((float(motion[key].t[0]) for key in needed), default=0.0)
-        if not len(felt) and needed and rate is not None:
-            span = min(float(motion[key].t[-1]) for key in needed) - begin
-            if span < 1 / rate:
-                got, expected = f"{max(span, 0):g} s of all grippers together", f"at least {1 / rate:g} s"
+    streams_with_frames = [s for s in (recording.points, recording.markers) if s is not None]
+    frame_times = [s.t + recording.clock_offset for s in streams_with_frames]
+    if not frame_times:
+        force_times = streams.find_force_times(recording, grasps)
+        begin = max((float(motion[key].t[0]) for key in grasps), default=0.0)
+        if not len(force_times) and grasps and rate is not None:
+            duration = min(float(motion[key].t[-1]) for key in grasps) - begin
+            if duration < 1 / rate:
+                got, expected = f"{max(duration, 0):g} s of all grippers together", f"at least {1 / rate:g} s"
                 raise RecordingError(f"{name}: motion", got=got, expected=expected, remedy="record all of it")
-            return begin + np.arange(int(span * rate + 1e-6) + 1) / rate, 0
-        if not len(felt):
+            return begin + np.arange(int(duration * rate + 1e-6) + 1) / rate, 0
+        if not len(force_times):
             recording.require("points", by="a fit")
-        return _overlap(felt[felt >= begin - streams.SAME], motion, needed)
-    first = seen[0]
-    if len(first) < 2:
+        return _times_within_motion(force_times[force_times >= begin - streams.SAME_TIME_S], motion, grasps)
+    first_stream = frame_times[0]
+    if len(first_stream) < 2:
         stream = "points" if recording.points is not None else "markers"
-        raise RecordingError(f"{name}: {stream}", got=f"{len(first)} frame(s)", expected="at least two")
-    times = streams.joined(seen)
-    return _overlap(times[times >= first[0] - streams.SAME], motion, needed)
+        raise RecordingError(f"{name}: {stream}", got=f"{len(first_stream)} frame(s)", expected="at least two")
+    times = streams.merge_times(frame_times)
+    return _times_within_motion(times[times >= first_stream[0] - streams.SAME_TIME_S], motion, grasps)
 
 
-def first_shape(name: str, cloth: Cloth, recording: Recording) -> Tensor:
-    """[V, 3] m, where the vertices are at the first frame.
+def compute_initial_vertices(name: str, cloth: Cloth, recording: Recording) -> Tensor:
+    """Return the vertex positions [V, 3] m at the first frame.
 
-    Where the cloth has the episode's triangles at other places of the pattern, positions are carried over to these.
+    Where the cloth has the episode's triangles at other places of the pattern, positions are interpolated there.
+
+    Args:
+        name: of the episode, in messages.
+        cloth: whose vertices are wanted.
+        recording: the episode.
 
     Raises:
-        InvalidInput: they do not belong to the cloth's mesh.
+        InvalidInput: initial vertices that do not belong to the cloth's mesh.
     """
     initial = recording.cloth.initial_vertices
     if initial is not None and initial.ndim == 3 and cloth.mesh.uv is not None:
-        initial = recording.cloth.initial_at(cloth.mesh.uv)
+        initial = recording.cloth.interpolate_initial_positions(cloth.mesh.uv)
     vertices = cloth.mesh.vertices if initial is None else initial
     if vertices.shape != cloth.mesh.vertices.shape:
         raise InvalidInput(
@@ -361,88 +397,102 @@ def first_shape(name: str, cloth: Cloth, recording: Recording) -> Tensor:
             expected=f"{len(cloth.mesh.vertices)}, one per vertex",
             remedy="give the mesh that the initial vertices belong to",
         )
-    return torch.as_tensor(vertices) if initial is None else on_mesh(cloth.mesh, recording, torch.as_tensor(initial))
+    if initial is None:
+        return torch.as_tensor(vertices)
+    return transfer_vertices(cloth.mesh, recording, torch.as_tensor(initial))
 
 
-def on_mesh(mesh: Mesh, recording: Recording, initial: Tensor) -> Tensor:
-    """[V, 3] m, positions of the vertices of an episode's mesh, carried to a mesh with the same triangles elsewhere.
+def transfer_vertices(mesh: Mesh, recording: Recording, initial: Tensor) -> Tensor:
+    """Interpolate vertex positions of an episode's mesh to a mesh with the same triangles at other pattern places.
+
+    Args:
+        mesh: the mesh.
+        recording: the episode.
+        initial: [V, 3] m, positions of the vertices of the episode's mesh.
+
+    Returns:
+        [V, 3] m, positions of the vertices of ``mesh``.
 
     Raises:
-        InvalidInput: its vertices are at other places of the pattern and its triangles are others.
+        InvalidInput: a mesh with other places of the pattern and other triangles.
     """
     info = recording.cloth
     if info.vertices is None or info.faces is None or info.uv is None or mesh.uv is None:
         return initial
-    if np.allclose(info.uv, mesh.uv, rtol=0, atol=SAME):
+    if np.allclose(info.uv, mesh.uv, rtol=0, atol=SAME_PATTERN_PLACE_M):
         return initial
-    own, theirs = (np.unique(np.sort(faces, axis=1), axis=0) for faces in (mesh.faces, info.faces))
-    if not np.array_equal(own, theirs):
+    triangles, recorded = (np.unique(np.sort(faces, axis=1), axis=0) for faces in (mesh.faces, info.faces))
+    if not np.array_equal(triangles, recorded):
         raise InvalidInput(
             "initial_vertices",
             got="those of a mesh with other triangles",
             expected="positions of the cloth's vertices, in its order",
-            remedy="build the cloth from the episode (cloth_from), or give it the cloth's mesh",
+            remedy="build the cloth from the episode (build_cloth), or give it the cloth's mesh",
         )
-    return carried(between(Mesh.build(info.vertices, info.faces, info.uv), mesh.uv), initial.double())
+    weights = interpolation_weights(Mesh.build(info.vertices, info.faces, info.uv), mesh.uv)
+    return interpolate_on_pattern(weights, initial.double())
 
 
-def _check_place(name: str, cloth: Cloth, motion: Mapping[str, Trajectory], x: Tensor, start: float) -> None:
-    """Refuse a cloth that is not where its grippers are: only their increments move it, so nothing else would show."""
+def _check_gripper_distance(name: str, cloth: Cloth, motion: Mapping[str, Trajectory], x: Tensor, start: float) -> None:
+    """Refuse a cloth that is far from its grippers: only their increments move it, so nothing else would show."""
+    time = torch.tensor([start], dtype=torch.float64)
     for key, boundary in cloth.boundaries.items():
         if isinstance(boundary, Grasp):
-            knot = int(last_knot(motion[key].t.double(), torch.tensor([start + 1e-9], dtype=torch.float64)))
+            knot = int(find_last_knot(motion[key].t.double(), time + TIME_AFTER_KNOT_S))
             if not motion[key].closed[max(knot, 0)]:  # it comes for the cloth later
                 continue
-            pose = interpolate(motion[key], torch.tensor([start], dtype=torch.float64))
-            gap = float((x[boundary.index].mean(0) - pose[0, :3, 3]).norm())
-            if gap > FARTHEST:
+            pose = interpolate_poses(motion[key], time)
+            distance = float((x[boundary.index].mean(0) - pose[0, :3, 3]).norm())
+            if distance > MAX_PATCH_TO_GRIPPER_M:
                 raise InvalidInput(
                     f"{name}: grasp {key!r}",
-                    got=f"the held patch {gap:.2f} m from its gripper at the first frame",
-                    expected=f"within {FARTHEST:g} m",
+                    got=f"the held patch {distance:.2f} m from its gripper at the first frame",
+                    expected=f"within {MAX_PATCH_TO_GRIPPER_M:g} m",
                     remedy="give cloth.initial_vertices in world coordinates, or check the gripper's path and frame",
                 )
 
 
-def _number(nominal: Mapping[str, Any], key: str, default: float) -> float:
-    """A data-sheet value; refuses what is not a number."""
-    try:
-        return float(nominal.get(key, default))
-    except (TypeError, ValueError):
-        raise RecordingError(f"cloth.nominal.{key}", got=repr(nominal[key]), expected="a number in SI units") from None
-
-
-def _overlap(times: np.ndarray, motion: Mapping[str, Trajectory], needed: list[str]) -> tuple[np.ndarray, int]:
-    """(those that the motion covers, number of others); it must cover the first, where the cloth is known."""
-    start = max((float(motion[key].t[0]) for key in needed), default=-np.inf)
-    end = min((float(motion[key].t[-1]) for key in needed), default=np.inf)
-    inside = np.flatnonzero((times >= start - 1e-6) & (times <= end + 1e-6))
+def _times_within_motion(
+    times: np.ndarray, motion: Mapping[str, Trajectory], grasps: list[str]
+) -> tuple[np.ndarray, int]:
+    """(times that the motion covers, number of others); it must cover the first one, where the cloth is known."""
+    start = max((float(motion[key].t[0]) for key in grasps), default=-np.inf)
+    end = min((float(motion[key].t[-1]) for key in grasps), default=np.inf)
+    inside = np.flatnonzero((times >= start - TIME_TOLERANCE_S) & (times <= end + TIME_TOLERANCE_S))
     if len(inside) < 2 or inside[0] != 0:
-        seen = f"frames in [{times[0]:g}, {times[-1]:g}] s" if len(times) else "no frames"
+        frames = f"frames in [{times[0]:g}, {times[-1]:g}] s" if len(times) else "no frames"
         raise RecordingError(
             "points and motion",
-            got=f"{seen}, motion in [{start:g}, {end:g}] s",
+            got=f"{frames}, motion in [{start:g}, {end:g}] s",
             expected="motion that covers the first frame",
             remedy="check clock_offset",
         )
     return times[inside], len(times) - len(inside)
 
 
-def effects_of(recording: Recording) -> dict[str, AbstractEffect]:
-    """Weight; bending at its data-sheet value, if there is one; drag of a flat plate, if there is air."""
+def build_effects(recording: Recording) -> dict[str, AbstractEffect]:
+    """Return gravity; bending at its data-sheet value, if there is one; drag of a flat plate, if there is air."""
     effects: dict[str, AbstractEffect] = {"gravity": Gravity(recording.gravity.tolist())}
     nominal = recording.cloth.nominal
     if "bending_stiffness" in nominal:
-        damping = _number(nominal, "bending_damping_time", 0.0) or None  # nothing to learn where none is stated
-        effects["bending"] = Bending(_number(nominal, "bending_stiffness", 0.0), damping)
+        damping = _nominal_number(nominal, "bending_damping_time", 0.0) or None  # nothing to learn where none is stated
+        effects["bending"] = Bending(_nominal_number(nominal, "bending_stiffness", 0.0), damping)
     if recording.air_density is not None:
         effects["air"] = AirDrag(normal=AirDrag.amplitudes["normal"].typical, density=recording.air_density)
     return effects
 
 
-def material_of(recording: Recording) -> AEP:
-    """At the episode's nominal values, or at a start in the middle of published fabrics."""
-    nominal, h = recording.cloth.nominal, recording.cloth.thickness or THICKNESS
-    stiffness = _number(nominal, "membrane_stiffness", DEFAULT_STIFFNESS)
-    youngs = _number(nominal, "youngs_modulus", stiffness / h)
-    return AEP(youngs, _number(nominal, "poisson_ratio", DEFAULT_POISSON), thickness=h)
+def build_material(recording: Recording) -> AEP:
+    """Return a material at the episode's nominal values, or at a start in the middle of published fabrics."""
+    nominal, thickness = recording.cloth.nominal, recording.cloth.thickness or DEFAULT_THICKNESS_M
+    stiffness = _nominal_number(nominal, "membrane_stiffness", DEFAULT_MEMBRANE_STIFFNESS_N_PER_M)
+    youngs_modulus = _nominal_number(nominal, "youngs_modulus", stiffness / thickness)
+    poisson_ratio = _nominal_number(nominal, "poisson_ratio", DEFAULT_POISSON_RATIO)
+    return AEP(youngs_modulus, poisson_ratio, thickness=thickness)
+
+
+def _nominal_number(nominal: Mapping[str, Any], key: str, default: float) -> float:
+    try:
+        return float(nominal.get(key, default))
+    except (TypeError, ValueError):
+        raise RecordingError(f"cloth.nominal.{key}", got=repr(nominal[key]), expected="a number in SI units") from None

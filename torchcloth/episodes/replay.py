@@ -10,48 +10,57 @@ import torch.autograd.forward_ad as forward_ad
 from torch import Tensor, nn
 
 from ..cloth import Cloth
-from ..parameters import called
+from ..parameters import call_with_parameters
 from ..simulation.sensitivities import Directions
 from ..types import ClothState, Rollout
 from .observed import Episode
-from .unknowns import Unknown, overrides
+from .unknowns import Unknown, make_state_entries
 
-SETTLING = 0.3  # s, in which the noise of measured positions is damped out
+SETTLE_TIME_S = 0.3  # in which the noise of measured positions is damped out
 
 
 class Frames(NamedTuple):
-    """What an observer has of the cloth at an episode's T frames; or derivatives of it, with K in front."""
+    """What an observer sees of the cloth at an episode's T frames; or derivatives of it, with K in front.
 
-    x: Tensor  # [T, V, 3] m
-    v: Tensor  # [T, V, 3] m/s
-    wrench: dict[str, Tensor]  # gripper -> [T, 6] N, N m
-    edge: Tensor  # [T] m, by how much the rim seems farther out than it is
+    Attributes:
+        x: [T, V, 3] m.
+        v: [T, V, 3] m/s.
+        wrench: gripper -> [T, 6] N, N m.
+        rim_offset: [T] m, distance by which the rim seems farther out than it is.
+    """
+
+    x: Tensor
+    v: Tensor
+    wrench: dict[str, Tensor]
+    rim_offset: Tensor
 
 
 class Replay(nn.Module):
-    """A cloth driven through an episode: settle, then follow the motion."""
+    """A cloth driven through an episode: it settles, then follows the motion."""
 
     def __init__(self, cloth: Cloth) -> None:
         super().__init__()
         self.cloth = cloth
 
     def forward(self, episode: Episode, dt: float | None = None) -> Rollout:
-        """The simulation at the frame times."""
+        """Simulate the episode at its frame times."""
         state = self.cloth.state(episode.initial)
-        if episode.settles:
-            state = self.cloth.settle(state, episode.motion, start=float(episode.times[0]), duration=SETTLING)
+        if episode.needs_settling:
+            start = float(episode.times[0])
+            state = self.cloth.settle(state, episode.motion, start=start, duration=SETTLE_TIME_S)
         return self.cloth(state, episode.motion, episode.times, dt=dt)
 
 
 def simulate(
     cloth: Cloth, unknowns: Sequence[Unknown], raw: Tensor, episode: Episode, dt: float | None = None
 ) -> Frames:
-    """The episode at the unknowns ``raw`` [K]; differentiable in reverse mode when ``raw`` requires grad."""
-    entries = {f"cloth.{key}": value.to(episode.initial) for key, value in overrides(unknowns, raw).items()}
-    return frames_of(called(Replay(cloth), entries, (episode, dt)))
+    """Simulate the episode at the unknowns ``raw`` [K]; differentiable in reverse mode when ``raw`` requires grad."""
+    values = make_state_entries(unknowns, raw)
+    entries = {f"cloth.{key}": value.to(episode.initial) for key, value in values.items()}
+    return frames_from_rollout(call_with_parameters(Replay(cloth), entries, (episode, dt)))
 
 
-def tangents(
+def simulate_with_tangents(
     cloth: Cloth,
     unknowns: Sequence[Unknown],
     raw: Tensor,
@@ -59,58 +68,69 @@ def tangents(
     dt: float | None = None,
     modes: Tensor | None = None,
 ) -> tuple[Frames, Frames]:
-    """The episode and its derivatives by the unknowns, then along ``modes`` [M, V, 3] of the initial shape.
+    """Simulate the episode with exact derivatives, in one forward pass.
 
-    Exact, in one forward pass; memory does not grow with the number of substeps.
+    Memory does not grow with the number of substeps.
+
+    Args:
+        cloth: the model.
+        unknowns: K parameters.
+        raw: [K] unconstrained values.
+        episode: what drives the cloth.
+        dt: largest substep [s]; None: the stable one.
+        modes: [M, V, 3] m, changes of the initial shape along which there are derivatives, too.
+
+    Returns:
+        The frames, and their derivatives by the unknowns, then along the modes, [K + M, ...].
     """
     extra = 0 if modes is None else len(modes)
     value = raw.detach().to(episode.initial)
-    eye = torch.eye(len(unknowns) + extra, len(unknowns), dtype=episode.initial.dtype)
-    entries = {f"cloth.{key}": v for key, v in overrides(unknowns, value).items()}
-    along = Directions(overrides(unknowns, eye))
+    directions = torch.eye(len(unknowns) + extra, len(unknowns), dtype=episode.initial.dtype)
+    entries = {f"cloth.{key}": v for key, v in make_state_entries(unknowns, value).items()}
+    along = Directions(make_state_entries(unknowns, directions))
     if modes is not None and extra:
-        along = along._replace(state=state_along(cloth, episode, modes, len(unknowns)))
-    out, moved = called(_Tangents(cloth), entries, (episode, along, dt))
-    return frames_of(out), frames_of(moved)
+        along = along._replace(state=initial_state_tangents(cloth, episode, modes, len(unknowns)))
+    out, tangents = call_with_parameters(_ReplayWithTangents(cloth), entries, (episode, along, dt))
+    return frames_from_rollout(out), frames_from_rollout(tangents)
 
 
-class _Tangents(nn.Module):
-    """As ``Replay``, with derivatives."""
-
+class _ReplayWithTangents(nn.Module):
     def __init__(self, cloth: Cloth) -> None:
         super().__init__()
         self.cloth = cloth
 
     def forward(self, episode: Episode, along: Directions, dt: float | None) -> tuple[Rollout, Rollout]:
-        """The rollout and its tangents."""
-        state, settle = self.cloth.state(episode.initial), SETTLING if episode.settles else 0.0
+        state, settle = self.cloth.state(episode.initial), SETTLE_TIME_S if episode.needs_settling else 0.0
         return self.cloth.sensitivities(state, episode.motion, episode.times, along=along, dt=dt, settle=settle)
 
 
-def each(frames: Frames, function: Callable[[Tensor], Tensor]) -> Frames:
-    """``function`` of every tensor."""
+def map_frames(frames: Frames, function: Callable[[Tensor], Tensor]) -> Frames:
+    """Apply a function to every tensor of some frames."""
     wrench = {name: function(w) for name, w in frames.wrench.items()}
-    return Frames(function(frames.x), function(frames.v), wrench, function(frames.edge))
+    return Frames(function(frames.x), function(frames.v), wrench, function(frames.rim_offset))
 
 
-def frames_of(rollout: Rollout) -> Frames:
-    """What an observer without errors of its own has of a rollout."""
+def frames_from_rollout(rollout: Rollout) -> Frames:
+    """Return what an observer without errors sees of a rollout."""
     return Frames(rollout.x, rollout.v, rollout.wrench, rollout.x.new_zeros(rollout.x.shape[:-2]))
 
 
-def state_along(cloth: Cloth, episode: Episode, modes: Tensor, before: int) -> ClothState:
-    """Tangents of the first state: ``before`` directions that leave it alone, then the modes."""
+def initial_state_tangents(cloth: Cloth, episode: Episode, modes: Tensor, before: int) -> ClothState:
+    """Compute tangents of the first state: ``before`` zero directions, then the modes [M, V, 3] m."""
     rest = cloth.state(episode.initial)
-    moved = []
+    mode_tangents = []
     with torch.no_grad():
         for mode in modes:
             with forward_ad.dual_level():
                 state = cloth.state(forward_ad.make_dual(rest.x, mode.to(rest.x).contiguous()))
-                moved.append(state.map(_tangent))
-    still = rest.map(lambda field: field.new_zeros(before, *field.shape))
-    join = lambda a, *b: torch.cat([a, *(t.unsqueeze(0) for t in b)])  # noqa: E731
-    memory = {name: join(value, *(m.memory[name] for m in moved)) for name, value in still.memory.items()}
-    x, v, d3 = (join(getattr(still, n), *(getattr(m, n) for m in moved)) for n in ("x", "v", "d3"))
+                mode_tangents.append(state.map(_tangent))
+    zeros = rest.map(lambda field: field.new_zeros(before, *field.shape))
+
+    def join(first: Tensor, *others: Tensor) -> Tensor:
+        return torch.cat([first, *(t.unsqueeze(0) for t in others)])
+
+    memory = {name: join(value, *(m.memory[name] for m in mode_tangents)) for name, value in zeros.memory.items()}
+    x, v, d3 = (join(getattr(zeros, n), *(getattr(m, n) for m in mode_tangents)) for n in ("x", "v", "d3"))
     return ClothState(x, v, d3, memory)
 
 

@@ -1,46 +1,48 @@
-"""Steps beside a model's point, within the ends of its coordinates."""
+"""Finite steps around a model's point, within the bounds of its coordinates."""
 
 from __future__ import annotations
 
-from .world import Model
+from .world import WorldModel
 
 
-def step_sizes(model: Model) -> list[tuple[int, float]]:
-    """(coordinate, small step) along each of the model's own."""
-    return list(enumerate([*(p.step for p in model.parameters), *(h.step * h.typical for h in model.accepted)]))
+def list_steps(model: WorldModel) -> list[tuple[int, float]]:
+    """Return (coordinate, small step) along each of the model's coordinates."""
+    parameters = [p.step for p in model.parameters]
+    return list(enumerate([*parameters, *(h.step_fraction * h.typical for h in model.accepted)]))
 
 
-def both_ways(model: Model) -> list[tuple[int, float]]:
-    """(coordinate, step) there and back along each of the model's own, but for what lies beyond its ends.
+def central_steps(model: WorldModel) -> list[tuple[int, float]]:
+    """Return (coordinate, step) forwards and backwards along each coordinate, without steps beyond its bounds.
 
-    One of which both lie beyond goes there, as far as it may (``taken``).
+    A coordinate along which both steps are beyond the bounds has the forward one, which ``clip_step`` shortens.
     """
-    low, high = (end.tolist() for end in model.ends)
+    low, high = (bound.tolist() for bound in model.bounds)
     here = model.point.tolist()
-    every = [(k, sign * step) for k, step in step_sizes(model) for sign in (1.0, -1.0)]
-    within = [(k, step) for k, step in every if low[k] <= here[k] + step <= high[k]]
-    told = {k for k, _ in within}
-    return sorted([*within, *(way for way in step_sizes(model) if way[0] not in told)], key=lambda way: way[0])
+    candidates = [(k, sign * step) for k, step in list_steps(model) for sign in (1.0, -1.0)]
+    inside = [(k, step) for k, step in candidates if low[k] <= here[k] + step <= high[k]]
+    covered = {k for k, _ in inside}
+    clipped = [pair for pair in list_steps(model) if pair[0] not in covered]
+    return sorted([*inside, *clipped], key=lambda pair: pair[0])
 
 
-def one_way(model: Model) -> list[tuple[int, float]]:
-    """(coordinate, step) along each of the model's own, back where there lies beyond an end."""
-    ways: dict[int, float] = {}
-    for k, step in [*both_ways(model), *step_sizes(model)]:
-        ways.setdefault(k, step)
-    return sorted(ways.items())
+def one_sided_steps(model: WorldModel) -> list[tuple[int, float]]:
+    """Return (coordinate, step) along each coordinate, backwards where the forward step is beyond a bound."""
+    steps: dict[int, float] = {}
+    for k, step in [*central_steps(model), *list_steps(model)]:
+        steps.setdefault(k, step)
+    return sorted(steps.items())
 
 
-def shifted(model: Model, coordinate: int, step: float) -> Model:
-    """Beside the model's point."""
-    beside = model.point
-    beside[coordinate] += step
-    return model.at(beside)
+def shift_model(model: WorldModel, coordinate: int, step: float) -> WorldModel:
+    """Return the model shifted by a step along one coordinate."""
+    point = model.point
+    point[coordinate] += step
+    return model.at_point(point)
 
 
-def taken(model: Model, coordinate: int, step: float) -> float:
-    """The step as far as the coordinate's ends allow; one of no length tells nothing, whatever it is divided by."""
-    low, high = (float(end[coordinate]) for end in model.ends)
+def clip_step(model: WorldModel, coordinate: int, step: float) -> float:
+    """Return the step as far as the bounds allow; the step itself if they allow none, so that it can divide."""
+    low, high = (float(bound[coordinate]) for bound in model.bounds)
     here = float(model.point[coordinate])
-    there = min(max(here + step, low), high)
-    return step if there == here + step else there - here or step
+    shifted = min(max(here + step, low), high)
+    return step if shifted == here + step else shifted - here or step

@@ -18,67 +18,79 @@ from ..errors import TorchclothError
 from ..materials import AbstractMaterial
 from ..meshes import Mesh
 from ..recordings import Recording
-from ..simulation.bound_modules import loose
+from ..simulation.bound_modules import copy_parts
 from .observed import Episode
-from .replay import Frames, Replay, frames_of
-from .user_errors import blame
+from .replay import Frames, Replay, frames_from_rollout
+from .user_errors import explain_user_error
 
-MATTERS = 0.75  # of the smallest amplitude of interest: what is fitted may fall short of what is there
-MIGHT_MATTER = 0.5  # the same, beside what matters
-RESIDUAL = "residual"  # and a dot: names of laws that are no causes
-OFTEN = 3.0  # prior standard deviations, from which a parameter does another effect's job
-Motion = Callable[[Episode], Episode]  # what the robot really does, from what it says
-View = Callable[[Frames, Episode], Frames]  # what is seen, from what is there
+RELEVANT_FRACTION = 0.75  # of the smallest amplitude of interest: a fitted amplitude may fall short of the true one
+POSSIBLY_RELEVANT_FRACTION = 0.5  # of the smallest amplitude of interest, for what is confounded with a relevant cause
+RESIDUAL_EFFECT_PREFIX = "residual"  # followed by a dot: names of laws that are no causes
+STRAINED_PRIOR_STDS = 3.0  # distance from the data sheet at which a parameter replaces a missing effect
+MAX_CLOCK_DELAY_S = 0.05  # simulations continue for this long after the last frame, for observers with a late clock
+MotionTransform = Callable[[Episode], Episode]  # commanded episode -> what the robot really does
+ObservationTransform = Callable[[Frames, Episode], Frames]  # true frames -> observed frames
 
 
 @dataclass(frozen=True, eq=False)
 class World:
-    """A cloth, what the robot really does with it, and how it is looked at."""
+    """A cloth, what the robot really does with it, and how it is observed.
+
+    Attributes:
+        cloth: the model.
+        motion_transforms: errors of the robot, applied in order.
+        observation_transforms: errors of the observer, applied in order.
+    """
 
     cloth: Cloth
-    motions: tuple[Motion, ...] = ()
-    views: tuple[View, ...] = ()
+    motion_transforms: tuple[MotionTransform, ...] = ()
+    observation_transforms: tuple[ObservationTransform, ...] = ()
 
-    def frames(self, episode: Episode, dt: float | None = None) -> Frames:
-        """What an observer has of the episode, simulated without derivatives.
+    def simulate_observed(self, episode: Episode, dt: float | None = None) -> Frames:
+        """Simulate what an observer sees of the episode, without derivatives.
 
-        One with a late clock sees beyond the last frame (``Episode.beyond``): give the episode more than are wanted.
+        An observer with a late clock sees beyond the last frame (``Episode.with_lookahead``): the episode must have
+        more frames than are wanted.
         """
-        return self.seen(self.simulated(episode, dt), episode)
+        return self.observe(self.simulate(episode, dt), episode)
 
-    def simulated(self, episode: Episode, dt: float | None = None) -> Frames:
-        """What happens, whoever looks on."""
+    def simulate(self, episode: Episode, dt: float | None = None) -> Frames:
+        """Simulate what happens, without errors of an observer and without derivatives."""
         with torch.no_grad():
-            return frames_of(Replay(self.cloth)(self.driven(episode), dt))
+            return frames_from_rollout(Replay(self.cloth)(self.apply_motion(episode), dt))
 
-    def driven(self, episode: Episode) -> Episode:
-        """The episode with what the robot really does."""
-        for motion in self.motions:
-            episode = motion(episode)
+    def apply_motion(self, episode: Episode) -> Episode:
+        """Return the episode with what the robot really does."""
+        for transform in self.motion_transforms:
+            episode = transform(episode)
         return episode
 
-    def seen(self, frames: Frames, episode: Episode) -> Frames:
-        """What an observer has of what happens."""
-        for view in self.views:
-            frames = view(frames, episode)
+    def observe(self, frames: Frames, episode: Episode) -> Frames:
+        """Return what an observer sees of simulated frames."""
+        for transform in self.observation_transforms:
+            frames = transform(frames, episode)
         return frames
 
-    def identity(self, episode: Episode) -> list[object]:
-        """What simulations of it depend on beside the cloth: of functions, what they make of a shape that drifts."""
-        driven = self.driven(episode)
+    def fingerprint_parts(self, episode: Episode) -> list[object]:
+        """List everything but the cloth that simulations depend on.
+
+        The transforms are functions. What they make of a shape that drifts stands for them.
+        """
+        driven = self.apply_motion(episode)
         v = torch.ones_like(driven.initial).expand(len(driven.times), -1, -1)
         x = driven.initial + v * (driven.times - driven.times[0]).to(v)[:, None, None]
-        still = {name: v.new_zeros(len(v), 6) for name in driven.motion}
-        seen = self.seen(Frames(x, v, still, v.new_zeros(len(v))), driven)
-        return [*driven.identity(), seen.x, seen.v, *seen.wrench.values(), seen.edge]
+        zero_wrench = {name: v.new_zeros(len(v), 6) for name in driven.motion}
+        observed = self.observe(Frames(x, v, zero_wrench, v.new_zeros(len(v))), driven)
+        frames = [observed.x, observed.v, *observed.wrench.values(), observed.rim_offset]
+        return [*driven.fingerprint_parts(), *frames]
 
-    def with_motion(self, motion: Motion) -> World:
-        """The same with one more error of the robot."""
-        return replace(self, motions=(*self.motions, motion))
+    def with_motion_transform(self, transform: MotionTransform) -> World:
+        """Return the world with one more error of the robot."""
+        return replace(self, motion_transforms=(*self.motion_transforms, transform))
 
-    def with_view(self, view: View) -> World:
-        """The same with one more error of the observer."""
-        return replace(self, views=(*self.views, view))
+    def with_observation_transform(self, transform: ObservationTransform) -> World:
+        """Return the world with one more error of the observer."""
+        return replace(self, observation_transforms=(*self.observation_transforms, transform))
 
     def with_cloth(
         self,
@@ -86,57 +98,67 @@ class World:
         material: AbstractMaterial | None = None,
         boundaries: Mapping[str, AbstractBoundary] | None = None,
     ) -> World:
-        """The same with other or more parts of the cloth, by name."""
-        return replace(self, cloth=rebuilt(self.cloth, effects or {}, material, boundaries or {}))
+        """Return the world with parts of the cloth replaced or added, by name."""
+        return replace(self, cloth=rebuild_cloth(self.cloth, effects or {}, material, boundaries or {}))
 
 
-def copied(cloth: Cloth) -> Cloth:
-    """A cloth of its own on the same mesh, which nobody changes."""
+def copy_cloth(cloth: Cloth) -> Cloth:
+    """Return a copy of a cloth that shares its mesh."""
     return copy.deepcopy(cloth, {id(cloth.mesh): cloth.mesh})
 
 
-def rebuilt(
+def rebuild_cloth(
     cloth: Cloth,
     effects: Mapping[str, AbstractEffect],
     material: AbstractMaterial | None,
     boundaries: Mapping[str, AbstractBoundary],
     mesh: Mesh | None = None,
 ) -> Cloth:
-    """A new cloth with some parts replaced or added, which nobody trains; it shares the mesh alone with the old one."""
-    kept = loose(cloth)
-    found = Cloth(
+    """Return a new cloth with some parts replaced or added, without gradients; it shares only the mesh with the old.
+
+    Args:
+        cloth: the old one.
+        effects: by name.
+        material: None: the old one's.
+        boundaries: by name.
+        mesh: None: the old one's.
+    """
+    parts = copy_parts(cloth)
+    rebuilt = Cloth(
         mesh or cloth.mesh,
-        material or kept.material,
-        kept.areal_density,
-        {**kept.effects, **effects},
-        {**kept.boundaries, **boundaries},
+        material or parts.material,
+        parts.areal_density,
+        {**parts.effects, **effects},
+        {**parts.boundaries, **boundaries},
         cloth.contact,
         cloth.engine,
     )
-    return found.requires_grad_(False)
+    return rebuilt.requires_grad_(False)
 
 
 @dataclass(frozen=True)
 class Hypothesis:
-    """One number that changes a world; 0 is the world as it is.
+    """A possible cause of a misfit: one number that changes a world. At 0 the world stays as it is.
 
     Attributes:
-        name: e.g. "air.drag_n"; what errs alike along several axes shares it up to a bracket: "env.gravity_tilt[x]".
+        name: e.g. "air.drag_n". Errors that act alike along several axes share it up to a bracket:
+            "env.gravity_tilt[x]".
         unit: of the amplitude.
         typical: an amplitude that real recordings have.
         apply: (world, amplitude) -> world.
-        signed: negative amplitudes make sense.
-        share: smallest amplitude of interest, as a share of the typical one.
-        step: of slopes beside an amplitude, as a share of the typical one.
-        needs: what a recording must have for it to mean anything.
-        kin: names that no experiment of this kind can tell from it, by structure.
-        twin: base parameter that is the same number (``Parameter.more``); where that is fitted, its prior alone tells
-            of the hypothesis.
-        low, high: amplitudes that a world can have.
-        brings: another hypothesis, which comes along at its typical amplitude where the world has none of it.
-        finer: its slopes are taken on the finer mesh where it does something on the given one: it acts in folds, for
-            which that is too coarse.
-        says: what it is in a sentence, for reports; the catalogue's have theirs in the glossary.
+        signed: whether negative amplitudes make sense.
+        smallest_fraction: smallest amplitude of interest, as a fraction of the typical one.
+        step_fraction: finite step of slopes, as a fraction of the typical amplitude.
+        is_applicable: recording -> whether the recording has what the hypothesis needs to mean anything.
+        structurally_equivalent: names that no experiment of this kind can separate from it.
+        equivalent_parameter: base parameter that is the same number (``BaseParameter.relative_change``). Where that is
+            fitted, its prior alone shows the hypothesis.
+        min_amplitude: least amplitude that a world can have.
+        max_amplitude: largest amplitude that a world can have.
+        implies: another hypothesis, which joins at its typical amplitude where the world has none of it.
+        needs_fine_mesh: whether its slopes are computed on the fine mesh, if it has an effect on the given one. It then
+            acts in folds, for which the given mesh is too coarse.
+        description: a sentence for reports; those of the catalogue have theirs in the glossary.
     """
 
     name: str
@@ -144,164 +166,187 @@ class Hypothesis:
     typical: float
     apply: Callable[[World, float], World]
     signed: bool = False
-    share: float = 0.4
-    step: float = 0.1
-    needs: Callable[[Recording], bool] = lambda recording: True
-    kin: tuple[str, ...] = ()
-    twin: str = ""
-    low: float = -math.inf
-    high: float = math.inf
-    brings: str = ""
-    finer: bool = False
-    says: str = ""
+    smallest_fraction: float = 0.4
+    step_fraction: float = 0.1
+    is_applicable: Callable[[Recording], bool] = lambda recording: True
+    structurally_equivalent: tuple[str, ...] = ()
+    equivalent_parameter: str = ""
+    min_amplitude: float = -math.inf
+    max_amplitude: float = math.inf
+    implies: str = ""
+    needs_fine_mesh: bool = False
+    description: str = ""
 
     def __post_init__(self) -> None:
-        if isinstance(self.kin, list):  # which has no hash
-            object.__setattr__(self, "kin", tuple(self.kin))
+        if isinstance(self.structurally_equivalent, list):  # a list has no hash
+            object.__setattr__(self, "structurally_equivalent", tuple(self.structurally_equivalent))
 
-    def applied(self, world: World, amplitude: float) -> World:
-        """The world with so much of it.
+    def apply_to(self, world: World, amplitude: float) -> World:
+        """Return the world with this amplitude of the hypothesis.
 
         Raises:
-            InvalidInput: it fails with an error that is none of the library's, or gives something else.
+            InvalidInput: ``apply`` fails with an error that is none of the library's, or returns no world.
         """
         try:
-            found = self.apply(world, amplitude)
-            if not isinstance(found, World):
-                raise TypeError(f"apply gives {type(found).__name__}, no World")
+            changed = self.apply(world, amplitude)
+            if not isinstance(changed, World):
+                raise TypeError(f"apply gives {type(changed).__name__}, no World")
         except TorchclothError:
             raise
-        except Exception as error:  # whatever a user's own does wrong
-            raise blame(self.name, error) from error
-        return found
+        except Exception as error:  # a user's function may raise anything
+            raise explain_user_error(self.name, error) from error
+        return changed
 
     @property
     def effect(self) -> str:
-        """The name without its axis."""
+        """Name without its axis."""
         return self.name.partition("[")[0]
 
     @property
-    def sizes(self) -> tuple[float | bool, ...]:
-        """What says from where on it matters, and how large it may be."""
-        return self.typical, self.share, self.step, self.signed, self.low, self.high
+    def amplitude_settings(self) -> tuple[float | bool, ...]:
+        """Numbers that say from where on it matters, and how large it may be."""
+        return (
+            self.typical,
+            self.smallest_fraction,
+            self.step_fraction,
+            self.signed,
+            self.min_amplitude,
+            self.max_amplitude,
+        )
 
     @property
-    def smallest(self) -> float:
-        """Of interest."""
-        return self.share * self.typical
+    def smallest_of_interest(self) -> float:
+        """Smallest amplitude of interest, in ``unit``."""
+        return self.smallest_fraction * self.typical
 
     @property
     def opposite(self) -> Hypothesis:
-        """The same, asked about the other way, as far as a world can have it."""
-        return replace(self, typical=min(max(-self.typical, self.low), self.high))
+        """The hypothesis with the typical amplitude of the other sign, as far as a world can have it."""
+        return replace(self, typical=min(max(-self.typical, self.min_amplitude), self.max_amplitude))
 
     @property
-    def reverses(self) -> bool:
-        """Asking the other way makes sense: there is more than a step to go."""
-        return self.signed and abs(self.opposite.typical) > abs(self.step * self.typical)
+    def is_reversible(self) -> bool:
+        """Whether the opposite makes sense: it allows more than a finite step."""
+        return self.signed and abs(self.opposite.typical) > abs(self.step_fraction * self.typical)
 
-    def matters(self, amplitude: float) -> bool:
-        """Large enough to be named."""
-        return abs(amplitude) > MATTERS * abs(self.smallest)
+    def is_relevant(self, amplitude: float) -> bool:
+        """Tell whether an amplitude is large enough to be named."""
+        return abs(amplitude) > RELEVANT_FRACTION * abs(self.smallest_of_interest)
 
-    def might_matter(self, amplitude: float) -> bool:
-        """Large enough to be named with what it cannot be told from, and which matters."""
-        return abs(amplitude) > MIGHT_MATTER * abs(self.smallest)
+    def is_possibly_relevant(self, amplitude: float) -> bool:
+        """Tell whether an amplitude is large enough to be named together with a relevant, confounded cause."""
+        return abs(amplitude) > POSSIBLY_RELEVANT_FRACTION * abs(self.smallest_of_interest)
 
 
 @dataclass(frozen=True)
-class Parameter:
-    """A number of the base model that is always fitted: log or plain, with a Gaussian prior around the data sheet.
+class BaseParameter:
+    """A number of the base model that is always fitted, with a Gaussian prior around the data sheet.
 
-    Plain where a logarithm or logit would saturate: a coordinate in which nothing moves any more has no end.
+    Its coordinate is a logarithm, or plain where a logarithm or logit would saturate: a coordinate along which nothing
+    moves any more has no end.
 
     Attributes:
         name: public name of the parameter.
-        step: finite step for derivatives, in the coordinate.
-        std: of the prior, in the coordinate.
-        apply: (world, coordinate) -> world, which may be the given one, changed; 0 is the data sheet's value.
+        unit: of the physical value.
+        step: finite step of slopes, in the coordinate.
+        prior_std: standard deviation of the prior, in the coordinate.
+        apply: (world, coordinate) -> world, which may be the given one, changed. At 0 it has the data sheet's value.
         value: coordinate -> physical value.
-        low, high: least and largest coordinate.
+        min_coordinate: least coordinate.
+        max_coordinate: largest coordinate.
     """
 
     name: str
     unit: str
     step: float
-    std: float
+    prior_std: float
     apply: Callable[[World, float], World]
     value: Callable[[float], float]
-    low: float = -math.inf
-    high: float = math.inf
+    min_coordinate: float = -math.inf
+    max_coordinate: float = math.inf
 
-    def more(self, coordinate: float, than: float = 0.0) -> float:
-        """By how much a value exceeds that of another coordinate: as a share, or plainly where the sheet has 0."""
+    def relative_change(self, coordinate: float, than: float = 0.0) -> float:
+        """Return how much a value exceeds that of another coordinate, relative, or absolute where the sheet has 0.
+
+        Args:
+            coordinate: of the value.
+            than: coordinate of the value that it is compared with.
+        """
         before = self.value(than)
         return (self.value(coordinate) - before) / (before if self.value(0.0) else 1.0)
 
 
 @dataclass(frozen=True)
-class Model:
-    """A base world, values of its parameters, and amplitudes of the hypotheses that it has accepted."""
+class WorldModel:
+    """A base world, values of its parameters, and amplitudes of the hypotheses that it has accepted.
+
+    Attributes:
+        base: the world at the data sheet's values.
+        parameters: P parameters of the base world.
+        coordinates: [P] of the parameters.
+        accepted: A hypotheses.
+        amplitudes: of the accepted hypotheses.
+        episode_fingerprints: of the episodes that the numbers come from.
+    """
 
     base: World
-    parameters: tuple[Parameter, ...]
-    values: Tensor  # [P], coordinates
+    parameters: tuple[BaseParameter, ...]
+    coordinates: Tensor
     accepted: tuple[Hypothesis, ...] = ()
     amplitudes: tuple[float, ...] = ()
-    met: tuple[dict[str, Any], ...] = ()  # marks of episodes that its numbers come from
+    episode_fingerprints: tuple[dict[str, Any], ...] = ()
 
-    def world(self, extra: Sequence[tuple[Hypothesis, float]] = ()) -> World:
-        """The world at these numbers, with further hypotheses at given amplitudes."""
-        world = replace(self.base, cloth=copied(self.base.cloth))
-        for parameter, coordinate in zip(self.parameters, self.values.tolist(), strict=True):
+    def build_world(self, extra: Sequence[tuple[Hypothesis, float]] = ()) -> World:
+        """Build the world at these numbers, with further (hypothesis, amplitude) pairs."""
+        world = replace(self.base, cloth=copy_cloth(self.base.cloth))
+        for parameter, coordinate in zip(self.parameters, self.coordinates.tolist(), strict=True):
             world = parameter.apply(world, coordinate)
-        own = zip(self.accepted, self.amplitudes, strict=True)
-        brought = {h.brings for h in self.accepted}  # none of it, where that was found, is not what comes along
-        for hypothesis, amplitude in (*own, *extra):
-            if amplitude or hypothesis.name in brought:
-                world = hypothesis.applied(world, amplitude)
+        accepted = zip(self.accepted, self.amplitudes, strict=True)
+        implied = {h.implies for h in self.accepted}  # one that was fitted to 0 must not join at its typical amplitude
+        for hypothesis, amplitude in (*accepted, *extra):
+            if amplitude or hypothesis.name in implied:
+                world = hypothesis.apply_to(world, amplitude)
         return world
 
     @property
     def point(self) -> Tensor:
         """[P + A] coordinates of the parameters, then amplitudes."""
-        return torch.cat([self.values, torch.tensor(self.amplitudes, dtype=self.values.dtype)])
+        return torch.cat([self.coordinates, torch.tensor(self.amplitudes, dtype=self.coordinates.dtype)])
 
-    def at(self, point: Tensor) -> Model:
-        """The same model elsewhere; coordinates and amplitudes stop at their ends, those without a sign at zero."""
-        values = point.clamp(*self.ends)
-        return replace(
-            self, values=values[: len(self.parameters)], amplitudes=tuple(values[len(self.parameters) :].tolist())
-        )
+    def at_point(self, point: Tensor) -> WorldModel:
+        """Return the model at another point [P + A], clipped to the bounds."""
+        clipped, count = point.clamp(*self.bounds), len(self.parameters)
+        return replace(self, coordinates=clipped[:count], amplitudes=tuple(clipped[count:].tolist()))
 
     @property
-    def ends(self) -> tuple[Tensor, Tensor]:
-        """(least, largest) of the coordinates [P + A]."""
-        own = [(p.low, p.high) for p in self.parameters]
-        own += [(h.low if h.signed else max(h.low, 0.0), h.high) for h in self.accepted]
-        low, high = torch.tensor(own, dtype=self.values.dtype).reshape(-1, 2).unbind(-1)
+    def bounds(self) -> tuple[Tensor, Tensor]:
+        """Least and largest point, [P + A] each; amplitudes without a sign end at zero."""
+        pairs = [(p.min_coordinate, p.max_coordinate) for p in self.parameters]
+        pairs += [(h.min_amplitude if h.signed else max(h.min_amplitude, 0.0), h.max_amplitude) for h in self.accepted]
+        low, high = torch.tensor(pairs, dtype=self.coordinates.dtype).reshape(-1, 2).unbind(-1)
         return low, high
 
     @property
-    def strained(self) -> list[tuple[Parameter, float]]:
-        """Parameters farther from their data sheet than these are wrong, with prior standard deviations."""
-        away = [(p, abs(c) / p.std) for p, c in zip(self.parameters, self.values.tolist(), strict=True)]
-        return [(p, far) for p, far in away if far > OFTEN]
+    def strained_parameters(self) -> list[tuple[BaseParameter, float]]:
+        """Parameters that are far from their data sheet, with the distance in prior standard deviations."""
+        pairs = zip(self.parameters, self.coordinates.tolist(), strict=True)
+        distances = [(p, abs(coordinate) / p.prior_std) for p, coordinate in pairs]
+        return [(p, distance) for p, distance in distances if distance > STRAINED_PRIOR_STDS]
 
-    def others(self, hypotheses: Sequence[Hypothesis]) -> list[Hypothesis]:
-        """Those that it has not accepted."""
-        taken = {h.name for h in self.accepted}
-        return [h for h in hypotheses if h.name not in taken]
+    def not_accepted(self, hypotheses: Sequence[Hypothesis]) -> list[Hypothesis]:
+        """Return those of some hypotheses that the model has not accepted."""
+        names = {h.name for h in self.accepted}
+        return [h for h in hypotheses if h.name not in names]
 
-    def place(self, name: str) -> int:
-        """Of an accepted hypothesis among them."""
+    def index_of(self, name: str) -> int:
+        """Return the index of an accepted hypothesis."""
         return [h.name for h in self.accepted].index(name)
 
-    def plus(self, hypothesis: Hypothesis, amplitude: float = 0.0) -> Model:
-        """With one more accepted hypothesis."""
+    def with_hypothesis(self, hypothesis: Hypothesis, amplitude: float = 0.0) -> WorldModel:
+        """Return the model with one more accepted hypothesis."""
         return replace(self, accepted=(*self.accepted, hypothesis), amplitudes=(*self.amplitudes, amplitude))
 
-    def without(self, name: str) -> Model:
-        """Less one accepted hypothesis."""
-        kept = [(h, a) for h, a in zip(self.accepted, self.amplitudes, strict=True) if h.name != name]
-        return replace(self, accepted=tuple(h for h, _ in kept), amplitudes=tuple(a for _, a in kept))
+    def without_hypothesis(self, name: str) -> WorldModel:
+        """Return the model without one of its accepted hypotheses."""
+        pairs = [(h, a) for h, a in zip(self.accepted, self.amplitudes, strict=True) if h.name != name]
+        return replace(self, accepted=tuple(h for h, _ in pairs), amplitudes=tuple(a for _, a in pairs))

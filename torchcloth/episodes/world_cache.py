@@ -1,7 +1,7 @@
-"""The worlds that are simulated about a model's point, each made once for all episodes.
+"""Cache of the worlds around a model's point, each built once for all episodes.
 
-A world is a cloth of its own, whose stencils take as long to make as an episode of some meshes takes to simulate.
-Nobody changes one, so all episodes and threads may share it.
+A world is a cloth of its own, whose stencils take as long to build as some episodes take to simulate. Worlds are never
+modified, so all episodes and threads may share them.
 """
 
 from __future__ import annotations
@@ -12,104 +12,113 @@ from functools import partial
 from threading import RLock
 from typing import Any, TypeVar
 
-from .._utils.caching import Recent
+from .._utils.caching import LRUCache
 from ..errors import InvalidInput, SimulationDiverged, UnstableStep
 from .observed import Episode
 from .replay import Frames
-from .steps import shifted
-from .world import Hypothesis, Model, World
+from .steps import shift_model
+from .world import Hypothesis, World, WorldModel
 
-IMPOSSIBLE = (InvalidInput, SimulationDiverged, UnstableStep)  # no world has such values, or none that is stable
+IMPOSSIBLE_WORLD_ERRORS = (InvalidInput, SimulationDiverged, UnstableStep)  # illegal values, or an unstable world
 T = TypeVar("T")
 
 
-class Worlds:
-    """Worlds of a model, made when they are first asked for.
+class WorldCache:
+    """Worlds of a model, built when they are first needed.
 
     Args:
         model: at its point.
-        shifts: (coordinate, step) of the points beside.
-        finer: the same base on a finer mesh.
-        recent: what has been simulated at this point and at others; None: nobody comes back to it.
+        shifts: (coordinate, step) of the shifted points.
+        fine_base: the base world on the fine mesh, or None.
+        recent: cache of simulations at this point and others; None: they are not needed again.
     """
 
     def __init__(
         self,
-        model: Model,
+        model: WorldModel,
         shifts: Sequence[tuple[int, float]] = (),
-        finer: World | None = None,
-        recent: Recent[Frames] | None = None,
+        fine_base: World | None = None,
+        recent: LRUCache[Frames] | None = None,
     ) -> None:
-        self.model, self.shifts, self._finer = model, list(shifts), finer
+        self.model, self.shifts, self._fine_base = model, list(shifts), fine_base
         self._recent = recent
-        self._made: dict[object, Any] = {}
-        self._making = RLock()
+        self._worlds: dict[object, Any] = {}
+        self._lock = RLock()
 
     @property
-    def plain(self) -> World:
-        """At the point."""
-        return self._once("plain", self.model.world)
+    def base(self) -> World:
+        """World at the point."""
+        return self._get_or_build("base", self.model.build_world)
 
     @property
-    def beside(self) -> list[World]:
-        """At the points beside; on the finer mesh along what has its slopes there."""
-        make = lambda shift, finer: shifted(self._on_finer if finer else self.model, *shift).world()  # noqa: E731
-        sides = enumerate(zip(self.shifts, self.finer_beside, strict=True))
-        return [self._once(k, partial(make, *side)) for k, side in sides]
+    def shifted(self) -> list[World]:
+        """Worlds at the shifted points, on the fine mesh along coordinates that need it."""
+
+        def build(shift: tuple[int, float], fine: bool) -> World:
+            return shift_model(self._fine_model if fine else self.model, *shift).build_world()
+
+        pairs = enumerate(zip(self.shifts, self.shifted_on_fine_mesh, strict=True))
+        return [self._get_or_build(k, partial(build, *pair)) for k, pair in pairs]
 
     @property
-    def finest(self) -> World:
-        """At the point, on the finer mesh."""
-        return self._once("finest", lambda: self._on_finer.world())
+    def fine(self) -> World:
+        """World at the point on the fine mesh."""
+        return self._get_or_build("fine", lambda: self._fine_model.build_world())
 
-    def happens(self, e: Episode, dt: float | None, finer: bool = False) -> Frames:
-        """An episode at the point, on the finer mesh if asked for, whoever looks on; nobody may write to it."""
-        model, world = self._on_finer if finer else self.model, self._at(finer)
+    def simulate(self, e: Episode, dt: float | None, fine: bool = False) -> Frames:
+        """Simulate an episode at the point, without errors of an observer; nobody may write to the frames.
+
+        Args:
+            e: the episode.
+            dt: largest substep [s]; None: the stable one.
+            fine: use the fine mesh.
+        """
+        model, world = self._fine_model if fine else self.model, self._at_point(fine)
         if self._recent is None:
-            return world.simulated(e, dt)
+            return world.simulate(e, dt)
         point = (model.base, model.parameters, model.accepted, tuple(model.point.tolist()))
-        return self._recent.of((point, e, dt), partial(world.simulated, e, dt))
+        return self._recent.get_or_compute((point, e, dt), partial(world.simulate, e, dt))
 
-    def seen(self, e: Episode, dt: float | None, finer: bool = False) -> Frames:
-        """What an observer has of that."""
-        return self._at(finer).seen(self.happens(e, dt, finer), e)
+    def observe(self, e: Episode, dt: float | None, fine: bool = False) -> Frames:
+        """Simulate what an observer sees of an episode at the point; the arguments are those of ``simulate``."""
+        return self._at_point(fine).observe(self.simulate(e, dt, fine), e)
 
-    def changed(self, hypothesis: Hypothesis, finer: bool = False) -> World | None:
-        """With a hypothesis at its typical amplitude, on the finer mesh if asked for; None: no such world."""
+    def with_typical(self, hypothesis: Hypothesis, fine: bool = False) -> World | None:
+        """Return the world with a hypothesis at its typical amplitude; None if there is no such world."""
         h = hypothesis
-        return self._once(
-            (h.name, h.typical, finer), lambda: if_possible(lambda: h.applied(self._at(finer), h.typical))
+        return self._get_or_build(
+            (h.name, h.typical, fine), lambda: none_if_impossible(lambda: h.apply_to(self._at_point(fine), h.typical))
         )
 
-    def _at(self, finer: bool) -> World:
-        return self.finest if finer else self.plain
+    def _at_point(self, fine: bool) -> World:
+        return self.fine if fine else self.base
 
-    def is_finer(self, hypothesis: Hypothesis) -> bool:
-        """Its slopes are taken on the finer mesh; there must be one."""
-        return hypothesis.finer and self._finer is not None
-
-    @property
-    def finer_beside(self) -> list[bool]:
-        """Which points beside are looked at on the finer mesh."""
-        own = [*(False for _ in self.model.parameters), *map(self.is_finer, self.model.accepted)]
-        return [own[coordinate] for coordinate, _ in self.shifts]
+    def uses_fine_mesh(self, hypothesis: Hypothesis) -> bool:
+        """Tell whether the hypothesis has its slopes on the fine mesh, and there is one."""
+        return hypothesis.needs_fine_mesh and self._fine_base is not None
 
     @property
-    def _on_finer(self) -> Model:
-        if self._finer is None:
-            raise ValueError("no finer mesh")
-        return replace(self.model, base=self._finer)
+    def shifted_on_fine_mesh(self) -> list[bool]:
+        """Whether each shifted point is simulated on the fine mesh."""
+        fine = [*(False for _ in self.model.parameters), *map(self.uses_fine_mesh, self.model.accepted)]
+        return [fine[coordinate] for coordinate, _ in self.shifts]
 
-    def _once(self, key: object, make: Callable[[], T]) -> T:
-        with self._making:
-            if key not in self._made:
-                self._made[key] = make()
-            return self._made[key]
+    @property
+    def _fine_model(self) -> WorldModel:
+        if self._fine_base is None:
+            raise ValueError("no fine mesh")
+        return replace(self.model, base=self._fine_base)
+
+    def _get_or_build(self, key: object, build: Callable[[], T]) -> T:
+        with self._lock:
+            if key not in self._worlds:
+                self._worlds[key] = build()
+            return self._worlds[key]
 
 
-def if_possible(work: Callable[[], T]) -> T | None:
-    """What comes of it; None of what no world allows, or what cannot be simulated."""
+def none_if_impossible(compute: Callable[[], T]) -> T | None:
+    """Return the result of ``compute``, or None if no such world exists or it cannot be simulated."""
     try:
-        return work()
-    except IMPOSSIBLE:
+        return compute()
+    except IMPOSSIBLE_WORLD_ERRORS:
         return None

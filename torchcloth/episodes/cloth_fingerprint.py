@@ -8,8 +8,8 @@ from pathlib import Path
 from ..cloth import Cloth
 
 
-def _source(kind: type) -> str:
-    """Of a part that is not the library's; empty where it is, which ``program`` knows, or where nobody can tell."""
+def _read_source(kind: type) -> str:
+    """Source of a user's part. Empty for parts of the library, whose version is hashed elsewhere, or if unreadable."""
     if kind.__module__.split(".")[0] in ("torchcloth", "torch"):
         return ""
     try:
@@ -18,22 +18,22 @@ def _source(kind: type) -> str:
         return ""
 
 
-def facts_of(cloth: Cloth) -> list[object]:
-    """All that its simulations depend on: tensors by name, and what its parts keep as plain numbers and words."""
+def cloth_fingerprint_parts(cloth: Cloth) -> list[object]:
+    """List tensors by name, classes and sources of the parts, and their attributes that are numbers or strings."""
     tensors = [part for pair in (*cloth.named_parameters(), *cloth.named_buffers()) for part in pair]
-    plain = [
+    attributes = [
         (path, name, value)
         for path, part in cloth.named_modules()
         for name, value in vars(part).items()
         if name != "training" and not name.startswith("_") and isinstance(value, (bool, int, float, str, tuple))
     ]
-    kinds = [(path, f"{type(part).__module__}.{type(part).__qualname__}") for path, part in cloth.named_modules()]
-    laws = [_source(kind) for kind in dict.fromkeys(type(part) for part in cloth.modules())]
+    classes = [(path, f"{type(part).__module__}.{type(part).__qualname__}") for path, part in cloth.named_modules()]
+    sources = [_read_source(kind) for kind in dict.fromkeys(type(part) for part in cloth.modules())]
     return [
-        *kinds,
-        *laws,
+        *classes,
+        *sources,
         *tensors,
-        *plain,
+        *attributes,
         cloth.mesh.rest.tobytes(),
         cloth.mesh.faces.tobytes(),
         cloth.contact,
