@@ -61,7 +61,7 @@ def _predict(options: argparse.Namespace) -> int:
     import torch
 
     from ..identification.result import IDENTIFICATION_FILE_NAME
-    from ..identification.tension.model import RESULT as TENSION_FILE_NAME
+    from ..identification.tension.model import TENSION_FILE_NAME
 
     torch.set_default_dtype(torch.float64)
     torch.set_num_threads(1)

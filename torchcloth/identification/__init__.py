@@ -1,52 +1,52 @@
 """From recordings to fabric parameters with error bars."""
 
-from ..episodes.observed import Episode, cloth_from, episode
+from ..episodes.observed import Episode, build_cloth, build_episode
 from .episode_prediction import EpisodePrediction, predict_episode
 from .fields import FieldFit, fit_fields
 from .fit import identify
-from .io.saved_fit import Replayed, fitted, is_fitted, replayed
-from .pictures import draw
-from .residuals.rigid_carry import rigid_carry
+from .io.saved_fit import ReplayedEpisode, is_fitted_episode, load_fitted_cloth, replay_fit
+from .pictures import save_fit_pictures
+from .residuals.rigid_carry import carry_rigidly
 from .result import Identification
 from .tables import print_fit, print_tension
 from .tension.fit import TensionFit, fit_tension
-from .tension.model import TensionModel, read_model
-from .tension.prediction import Band, TensionPrediction, cross_validated, predict_tension, specimen_like
+from .tension.model import TensionModel, read_tension_model
+from .tension.prediction import PredictionBand, TensionPrediction, cross_validate, make_specimen, predict_tension
 from .tension.specimens import AbstractSpecimen, Response, Trellis, Uniaxial
 from .uncertainty.estimates import Estimate
-from .uncertainty.posterior_samples import drawn
+from .uncertainty.posterior_samples import sample_posterior
 
 __all__ = [
     "AbstractSpecimen",
-    "Band",
     "Episode",
     "EpisodePrediction",
     "Estimate",
     "FieldFit",
     "Identification",
-    "Replayed",
+    "PredictionBand",
+    "ReplayedEpisode",
     "Response",
     "TensionFit",
     "TensionModel",
     "TensionPrediction",
     "Trellis",
     "Uniaxial",
-    "cloth_from",
-    "cross_validated",
-    "draw",
-    "drawn",
-    "episode",
+    "build_cloth",
+    "build_episode",
+    "carry_rigidly",
+    "cross_validate",
     "fit_fields",
     "fit_tension",
-    "fitted",
     "identify",
-    "is_fitted",
+    "is_fitted_episode",
+    "load_fitted_cloth",
+    "make_specimen",
     "predict_episode",
     "predict_tension",
     "print_fit",
     "print_tension",
-    "read_model",
-    "replayed",
-    "rigid_carry",
-    "specimen_like",
+    "read_tension_model",
+    "replay_fit",
+    "sample_posterior",
+    "save_fit_pictures",
 ]

@@ -1,4 +1,4 @@
-"""Pictures of a fit: the cloth over the cloud, the distance over time and iterations, the parameters with intervals."""
+"""Draw a fit: the cloth over the cloud, the distance over time and iterations, the parameters with intervals."""
 
 from __future__ import annotations
 
@@ -10,31 +10,44 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from .._utils.files import atomically
+from .._utils.files import write_atomically
 from ..cloth import Cloth
 from ..episodes.observed import Episode
-from ..losses import closest
+from ..losses import find_closest_points
 from .result import Identification
 
-WIDE = 5.0  # ends of an axis of positive values so many times apart are shown on a logarithmic one
-BEFORE, AFTER, NULL = "#b0653a", "#1f6f8b", "#888888"
+MIN_LOG_AXIS_RATIO = 5.0  # between the ends of an axis of positive values, from which it is logarithmic
+SHAPE_FRAMES = 4  # that are drawn of an episode
+BEFORE_COLOUR, AFTER_COLOUR, NULL_COLOUR = "#b0653a", "#1f6f8b", "#888888"
 
 
-def draw(fit: Identification, episodes: Sequence[Episode], faces: np.ndarray, folder: Path) -> list[Path]:
-    """Write fit.png and distances.png, forces.png, parameters.png into ``folder``, each where it has something to show.
+def save_fit_pictures(fit: Identification, episodes: Sequence[Episode], faces: np.ndarray, folder: Path) -> list[Path]:
+    """Write fit.png, distances.png, forces.png and parameters.png into ``folder``, those that have something to show.
 
-    Those of an earlier fit that now have nothing to show are removed.
+    Pictures of an earlier fit that now have nothing to show are removed.
+
+    Args:
+        fit: the result.
+        episodes: of the fit.
+        faces: [F, 3].
+        folder: made if it does not exist.
 
     Returns:
-        their paths.
+        Their paths.
     """
     folder.mkdir(parents=True, exist_ok=True)
-    figures, seen = {}, [k for k, e in enumerate(episodes) if any(len(e.positions(t)) for t in range(len(e.times)))]
+    figures, seen = (
+        {},
+        [k for k, e in enumerate(episodes) if any(len(e.observed_points(t)) for t in range(len(e.times)))],
+    )
     if seen:
-        figures = {"fit": shapes(fit, seen[0], episodes[seen[0]], faces), "distances": distances(fit, episodes, faces)}
-    if any(_felt(e) for e in episodes):
-        figures["forces"] = forces(fit, episodes)
-    figures["parameters"] = parameters(fit)
+        figures = {
+            "fit": plot_shapes(fit, seen[0], episodes[seen[0]], faces),
+            "distances": plot_distances(fit, episodes, faces),
+        }
+    if any(_force_readings(e) for e in episodes):
+        figures["forces"] = plot_forces(fit, episodes)
+    figures["parameters"] = plot_parameters(fit)
     for name in {"fit", "distances", "forces"} - figures.keys():
         (folder / f"{name}.png").unlink(missing_ok=True)
     return [save_figure(figure, folder / f"{name}.png") for name, figure in figures.items()]
@@ -42,27 +55,27 @@ def draw(fit: Identification, episodes: Sequence[Episode], faces: np.ndarray, fo
 
 def save_figure(figure: Any, path: Path) -> Path:
     """Write a matplotlib figure as PNG so that a crash leaves the old one or the new, never half."""
-    with atomically(path) as part:
+    with write_atomically(path) as part:
         figure.savefig(part, dpi=110, bbox_inches="tight")
     return path
 
 
 def _distance(cloud: Tensor, vertices: Tensor, faces: Tensor) -> np.ndarray:
-    return (cloud - closest(cloud, vertices, faces).on(vertices)).norm(dim=-1).numpy()
+    return (cloud - find_closest_points(cloud, vertices, faces).interpolate(vertices)).norm(dim=-1).numpy()
 
 
-def shapes(fit: Identification, k: int, episode: Episode, faces: np.ndarray) -> Any:
-    """Four frames of the ``k``-th episode: points coloured by their distance, over the start and the fit."""
+def plot_shapes(fit: Identification, k: int, episode: Episode, faces: np.ndarray) -> Any:
+    """Draw four frames of the ``k``-th episode: points coloured by their distance, over the start and the fit."""
     from matplotlib.cm import ScalarMappable
     from matplotlib.colors import Normalize
     from matplotlib.figure import Figure
 
     index = torch.as_tensor(faces)
-    clouds = [episode.positions(t) for t in range(len(episode.times))]
+    clouds = [episode.observed_points(t) for t in range(len(episode.times))]
     seen = np.flatnonzero([len(cloud) for cloud in clouds])
-    shown = seen[np.linspace(0, len(seen) - 1, 5).round().astype(int)[1:]]
+    shown = seen[np.linspace(0, len(seen) - 1, SHAPE_FRAMES + 1).round().astype(int)[1:]]
     figure = Figure(figsize=(15, 7.5))
-    axes = figure.subplots(2, 4, subplot_kw={"projection": "3d", "computed_zorder": False})
+    axes = figure.subplots(2, SHAPE_FRAMES, subplot_kw={"projection": "3d", "computed_zorder": False})
     figure.subplots_adjust(wspace=0.02, hspace=0.05, top=0.92, bottom=0.02, left=0.02)
     everything = torch.cat([fit.frames_after[k][shown].reshape(-1, 3), *(clouds[i] for i in shown)]).numpy()
     middle, half = (everything.max(0) + everything.min(0)) / 2, np.ptp(everything, axis=0).max() / 2
@@ -89,92 +102,95 @@ def shapes(fit: Identification, k: int, episode: Episode, faces: np.ndarray) -> 
     return figure
 
 
-def distances(fit: Identification, episodes: Sequence[Episode], faces: np.ndarray) -> Any:
-    """Mean distance over time, and over the iterations of the fit."""
+def plot_distances(fit: Identification, episodes: Sequence[Episode], faces: np.ndarray) -> Any:
+    """Draw the mean distance over time, and over the iterations of the fit."""
     from matplotlib.figure import Figure
 
     index = torch.as_tensor(faces)
     figure = Figure(figsize=(12, 4))
     over_time, over_fit = figure.subplots(1, 2)
     sources = (
-        ("carried rigidly", fit.frames_null, NULL),
-        ("start", fit.frames_before, BEFORE),
-        ("fitted", fit.frames_after, AFTER),
+        ("carried rigidly", fit.frames_null, NULL_COLOUR),
+        ("start", fit.frames_before, BEFORE_COLOUR),
+        ("fitted", fit.frames_after, AFTER_COLOUR),
     )
     for label, frames, colour in sources:
         for k, (x, episode) in enumerate(zip(frames, episodes, strict=True)):
-            shown = [t for t in range(len(x)) if len(episode.positions(t))]
-            mean = [1e3 * _distance(episode.positions(t), x[t], index).mean() for t in shown]
+            shown = [t for t in range(len(x)) if len(episode.observed_points(t))]
+            mean = [1e3 * _distance(episode.observed_points(t), x[t], index).mean() for t in shown]
             over_time.plot(episode.times[shown], mean, color=colour, label=label if k == 0 else None)
     over_time.set(xlabel="time [s]", ylabel="mean distance cloud to surface [mm]", yscale="log")
     over_time.legend()
-    for share in sorted({entry["frames"] for entry in fit.history}):
-        part = [entry for entry in fit.history if entry["frames"] == share]
-        style = {"marker": "o", "color": AFTER, "alpha": 1.0 if share == 1 else 0.4}
-        label = "all frames" if share == 1 else f"first {100 * share:.0f} % of the frames"
+    for fraction in sorted({entry["frame_fraction"] for entry in fit.history}):
+        part = [entry for entry in fit.history if entry["frame_fraction"] == fraction]
+        style = {"marker": "o", "color": AFTER_COLOUR, "alpha": 1.0 if fraction == 1 else 0.4}
+        label = "all frames" if fraction == 1 else f"first {100 * fraction:.0f} % of the frames"
         over_fit.plot([e["iteration"] for e in part], [1e3 * e["chamfer"] for e in part], label=label, **style)
-    over_fit.axhline(1e3 * fit.fit["chamfer_null"], color=NULL, linestyle="--", label="carried rigidly")
+    over_fit.axhline(1e3 * fit.fit["chamfer_null"], color=NULL_COLOUR, linestyle="--", label="carried rigidly")
     over_fit.set(xlabel="iteration", ylabel="Chamfer cloud to surface [mm]", yscale="log")
     over_fit.legend()
     figure.tight_layout()
     return figure
 
 
-def forces(fit: Identification, episodes: Sequence[Episode]) -> Any:
-    """Every gripper's force along its main direction, measured and simulated, one episode below the other."""
+def plot_forces(fit: Identification, episodes: Sequence[Episode]) -> Any:
+    """Draw every gripper's force along its main direction, measured and simulated, one row per episode."""
     from matplotlib.figure import Figure
 
-    felt = [(k, e, own) for k, e in enumerate(episodes) if (own := _felt(e))]
-    columns = max(len(own) for *_, own in felt)
-    figure = Figure(figsize=(6 * columns, 3 * len(felt) + 0.4))
-    axes = figure.subplots(len(felt), columns, squeeze=False)
-    for row, (k, e, own) in zip(axes, felt, strict=True):
-        for axis, (name, readings) in zip(row, own.items(), strict=False):
-            force, along = _main(readings)
+    rows = [(k, e, forces) for k, e in enumerate(episodes) if (forces := _force_readings(e))]
+    columns = max(len(forces) for *_, forces in rows)
+    figure = Figure(figsize=(6 * columns, 3 * len(rows) + 0.4))
+    axes = figure.subplots(len(rows), columns, squeeze=False)
+    for row, (k, e, forces) in zip(axes, rows, strict=True):
+        for axis, (name, readings) in zip(row, forces.items(), strict=False):
+            force, along = _along_main_direction(readings)
             axis.plot(e.times[1:], force @ along, ".", color="black", markersize=4, label="measured")
-            for label, source, colour in (("start", fit.forces_before, BEFORE), ("fitted", fit.forces_after, AFTER)):
+            for label, source, colour in (
+                ("start", fit.forces_before, BEFORE_COLOUR),
+                ("fitted", fit.forces_after, AFTER_COLOUR),
+            ):
                 axis.plot(e.times[1:], source[k][name][1:, :3] @ along, color=colour, label=label)
             axis.set(xlabel="time [s]", ylabel="force [N]")
             title = f"{e.name}, {name}: along ({', '.join(f'{a:.2f}' for a in along.tolist())})"
             axis.set_title(title, fontsize=10, parse_math=False)
-        for axis in row[len(own) :]:
+        for axis in row[len(forces) :]:
             axis.set_axis_off()
     axes[0, 0].legend()
     figure.tight_layout()
     return figure
 
 
-def _felt(e: Episode) -> dict[str, Tensor]:
-    """Forces [T, 3] N after the first frame, of grippers that read any."""
+def _force_readings(e: Episode) -> dict[str, Tensor]:
+    """Forces [T, 3] N after the first frame, of grippers that measured any."""
     forces = {name: wrench[1:, :3] for name, wrench in e.wrenches.items()}
     return {name: force for name, force in forces.items() if bool(force.isfinite().all(-1).any())}
 
 
-def _main(force: Tensor) -> tuple[Tensor, Tensor]:
-    """Readings [T, 3] and the unit vector [3] along which they are largest, towards most of them."""
-    known = force[force.isfinite().all(-1)]
-    along = torch.linalg.svd(known, full_matrices=False)[2][0]
-    return force, along * torch.sign((known @ along).sum())
+def _along_main_direction(force: Tensor) -> tuple[Tensor, Tensor]:
+    """(readings [T, 3], unit vector [3] along which they are largest, towards most of them)."""
+    measured = force[force.isfinite().all(-1)]
+    along = torch.linalg.svd(measured, full_matrices=False)[2][0]
+    return force, along * torch.sign((measured @ along).sum())
 
 
-def parameters(fit: Identification) -> Any:
-    """Start, estimate and 95 % interval of every fitted parameter."""
+def plot_parameters(fit: Identification) -> Any:
+    """Draw start, estimate and 95 % interval of every fitted parameter."""
     from matplotlib.figure import Figure
 
     shown = {n: e for n, e in fit.parameters.items() if e.source in ("data", "prior")}
     figure = Figure(figsize=(8, 1.1 * len(shown) + 0.6))
     axes = figure.subplots(len(shown), 1, squeeze=False)
     for axis, (name, e) in zip(axes[:, 0], shown.items(), strict=True):
-        colour = AFTER if e.identifiable else NULL
+        colour = AFTER_COLOUR if e.identifiable else NULL_COLOUR
         axis.plot(e.ci95, [0, 0], color=colour, linewidth=4, alpha=0.4, solid_capstyle="butt")
         axis.plot(e.value, 0, "o", color=colour)
-        axis.plot(e.initial, 0, "x", color=BEFORE)
+        axis.plot(e.initial, 0, "x", color=BEFORE_COLOUR)
         note = {"prior": " (measured)"}.get(e.source, "") if e.identifiable else "\n(not identifiable)"
         axis.set_ylabel(f"{name}{note}\n[{e.unit}]", rotation=0, ha="right", va="center", fontsize=9)
         axis.set_yticks([])
         axis.spines[["left", "top", "right"]].set_visible(False)
         ends = [*e.ci95, e.value, e.initial]
-        if min(ends) > 0 and max(ends) > WIDE * min(ends):
+        if min(ends) > 0 and max(ends) > MIN_LOG_AXIS_RATIO * min(ends):
             axis.set_xscale("log")
         axis.margins(x=0.1)
     figure.suptitle("estimate and 95 % interval; cross: start", fontsize=10)
@@ -182,8 +198,8 @@ def parameters(fit: Identification) -> Any:
     return figure
 
 
-def field_maps(fields: Mapping[str, Tensor], cloth: Cloth) -> Any:
-    """One value per triangle [F], on the cloth's pattern or, without one, on its rest mesh seen along z."""
+def plot_fields(fields: Mapping[str, Tensor], cloth: Cloth) -> Any:
+    """Draw one value per triangle [F] on the cloth's pattern or, without one, on its rest mesh seen along z."""
     from matplotlib.colors import LogNorm
     from matplotlib.figure import Figure
 
@@ -192,8 +208,8 @@ def field_maps(fields: Mapping[str, Tensor], cloth: Cloth) -> Any:
     figure = Figure(figsize=(5.5 * len(fields), 4.5), layout="constrained")
     for axis, (name, values) in zip(figure.subplots(1, len(fields), squeeze=False)[0], fields.items(), strict=True):
         shown = values.detach().numpy()
-        norm = LogNorm() if shown.max() > WIDE * shown.min() > 0 else None
-        drawn = axis.tripcolor(*place.T, np.asarray(mesh.faces), facecolors=shown, norm=norm)
-        figure.colorbar(drawn, ax=axis, label=getattr(cloth.material, name).unit, shrink=0.8)
+        norm = LogNorm() if shown.max() > MIN_LOG_AXIS_RATIO * shown.min() > 0 else None
+        triangles = axis.tripcolor(*place.T, np.asarray(mesh.faces), facecolors=shown, norm=norm)
+        figure.colorbar(triangles, ax=axis, label=getattr(cloth.material, name).unit, shrink=0.8)
         axis.set(title=name, aspect="equal", xlabel="m", ylabel="m")
     return figure

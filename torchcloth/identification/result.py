@@ -1,4 +1,4 @@
-"""What a fit says: numbers with their errors, distances before and after, and what to mistrust."""
+"""The result of a fit: estimates with their errors, distances before and after, and what to mistrust."""
 
 from __future__ import annotations
 
@@ -12,27 +12,29 @@ from typing import Any
 
 from torch import Tensor
 
-from .._utils.files import atomically, write_text
+from .._utils.files import write_atomically, write_text
 from ..cloth import Cloth
-from .uncertainty.estimates import Combination, Estimate, Influence, Profile
+from .uncertainty.estimates import Combination, Estimate, InfluenceStatement, Profile
 
-START = "start.tcm"  # beside identification.json: the model that a fit began with
-CONVENTION = (
-    "SI units. chamfer: one-sided, cloud to surface: mean over frames of the mean distance [m] from each measured "
-    "point to the nearest point of the simulated triangles. rms: root mean square of the same distances over all "
-    "points; both are null (JSON) where nothing was seen. null: the cloth moves rigidly with the grippers, undeformed, "
-    "and its forces are zero. force_rms: root mean square distance [N] from all force readings; constant: of each "
-    "gripper's mean reading. std: standard error of the estimate; noise "
-    "correlated within patches of the fabric and nearby frames is allowed for, and the noise of a measured first shape "
-    "where grippers hold, and the scatter between three or more episodes (among those that repeat each other by "
-    "split.motion or split.replicate_of, and among all others), widened as Student's t, and the way left to a search "
-    "cut short; "
-    "persistent model error is not. ci95: in the log (logit) coordinate; linear, cut at 0, for amplitudes of effects "
-    "and the cone; the profile's where there is one with both ends. identifiable: std below a "
-    "quarter of the value (of a typical amplitude, where the amplitude is smaller), and the fit beats the null. "
-    "source 'not in the model' or 'held fixed': value, std and ci95 are those of the prior. identifiability: how far "
-    "one standard deviation of the prior and 10 % of the value move the cloth [mm] and its forces [N], rms. nuisances: "
-    "what differs from episode to episode, [m], [s], [rad] or [N]."
+IDENTIFICATION_SCHEMA = "torchcloth.identification/1"
+IDENTIFICATION_FILE_NAME = "identification.json"
+START_MODEL_FILE_NAME = "start.tcm"  # the model that a fit began with, in the folder of its result
+IDENTIFICATION_CONVENTION = (
+    "SI units. chamfer: one-sided distance, cloud to surface: mean over frames of the mean distance [m] from each "
+    "measured point to the nearest point of the simulated triangles. rms: root mean square of the same distances over "
+    "all points. Both are null (JSON) where no points were measured. null: the baseline of a cloth that moves rigidly "
+    "with the grippers, undeformed, with forces of zero. force_rms: root mean square error [N] of all force readings; "
+    "constant: of each gripper's mean reading. std: standard error of the estimate. It accounts for noise that is "
+    "correlated within parts of the fabric and between nearby frames, for the noise of a measured first shape where "
+    "grippers hold, and for the scatter between three or more episodes: between those that repeat each other "
+    "(split.motion or split.replicate_of), and between all others, widened as Student's t. It also covers the "
+    "remaining step of a search that was cut short. It does not cover persistent model error. ci95: 95 % interval in "
+    "the log (logit) coordinate; for amplitudes of effects and the cone linear, cut at 0; the profile's where there is "
+    "one with both ends. identifiable: std is below a quarter of the value (of a typical amplitude, where the "
+    "amplitude is smaller), and the fit beats the null. source 'not in the model' or 'held fixed': value, std and ci95 "
+    "are those of the prior. identifiability: rms displacement of the cloth [mm] and rms change of its forces [N] by "
+    "one standard deviation of the prior, and by 10 % of the value. nuisances: what differs from episode to episode, "
+    "in [m], [s], [rad] or [N]."
 )
 
 
@@ -42,18 +44,21 @@ class Identification:
 
     Attributes:
         parameters: estimates by name.
-        fit: distances [m] before, after and for the null, counts, seconds.
+        fit: distances [m] before, after and of the null, counts, seconds.
         correlation: of the fitted parameters, name -> name -> correlation.
         warnings: what to mistrust, in sentences.
-        history: one entry per iteration: chamfer [m] and parameter values.
-        frames_before, frames_after, frames_null: [T, V, 3] m for each episode, as its observer sees them.
-        influences: what the data can tell of each fitted parameter, and which experiment would tell more.
-        combinations: of parameters, that the data determine together or leave open.
-        nuisances: by episode, estimates of what is not the fabric's: clock, camera, first shape.
-        profiles: of the parameters for which one was asked.
-        forces_before, forces_after: gripper -> [T, 6] N, N m for each episode, as ``Episode.wrenches``.
+        history: one entry per iteration: Chamfer distance [m] and parameter values.
+        frames_before: [T, V, 3] m of each episode at the start values, as its observer sees them.
+        frames_after: [T, V, 3] m of each episode at the fitted values, as its observer sees them.
+        frames_null: [T, V, 3] m of each episode, carried rigidly.
         keys: module path by name of the fitted parameters.
-        model: what else a repetition of the simulation needs (see ``saved``).
+        nuisances: estimates by episode of what is not the fabric's: clock, camera, first shape.
+        influences: by fitted parameter, how far it moves the cloth, and which experiment would determine it.
+        combinations: of parameters, which the data determine together or leave open.
+        model: what else a repetition of the simulation needs (see ``io.saved_fit``).
+        profiles: of the parameters for which one was asked.
+        forces_before: gripper -> [T, 6] N, N m of each episode at the start values, as ``Episode.wrenches``.
+        forces_after: the wrenches at the fitted values.
     """
 
     parameters: dict[str, Estimate]
@@ -66,7 +71,7 @@ class Identification:
     frames_null: list[Tensor] = field(repr=False)
     keys: dict[str, str] = field(default_factory=dict, repr=False)
     nuisances: dict[str, dict[str, Estimate]] = field(default_factory=dict)
-    influences: dict[str, Influence] = field(default_factory=dict)
+    influences: dict[str, InfluenceStatement] = field(default_factory=dict)
     combinations: list[Combination] = field(default_factory=list)
     model: dict[str, Any] = field(default_factory=dict, repr=False)
     profiles: dict[str, Profile] = field(default_factory=dict)
@@ -74,50 +79,59 @@ class Identification:
     forces_after: list[dict[str, Tensor]] = field(default_factory=list, repr=False)
 
     def as_dict(self) -> dict[str, Any]:
-        """The content of identification.json."""
+        """Return the content of identification.json."""
         return {
+            "schema": IDENTIFICATION_SCHEMA,
             "parameters": {name: asdict(estimate) for name, estimate in self.parameters.items()},
-            "fit": {name: or_none(value) for name, value in self.fit.items()},
-            "correlation": {a: {b: or_none(r) for b, r in row.items()} for a, row in self.correlation.items()},
+            "fit": {name: nan_to_none(value) for name, value in self.fit.items()},
+            "correlation": {a: {b: nan_to_none(r) for b, r in row.items()} for a, row in self.correlation.items()},
             "identifiability": {name: asdict(influence) for name, influence in self.influences.items()},
-            "combinations": [{"of": c.text, **asdict(c)} for c in self.combinations],
+            "combinations": [{"product": c.text, **asdict(c)} for c in self.combinations],
             "nuisances": {
-                episode: {name: asdict(estimate) for name, estimate in own.items()}
-                for episode, own in self.nuisances.items()
+                episode: {name: asdict(estimate) for name, estimate in estimates.items()}
+                for episode, estimates in self.nuisances.items()
             },
             "profiles": {name: asdict(profile) for name, profile in self.profiles.items()},
-            "convention": CONVENTION,
+            "convention": IDENTIFICATION_CONVENTION,
             "warnings": self.warnings,
-            "history": [{name: or_none(value) for name, value in entry.items()} for entry in self.history],
+            "history": [{name: nan_to_none(value) for name, value in entry.items()} for entry in self.history],
             "model": self.model,
         }
 
-    def save(self, folder: str | Path, begun: str | Path | None = None) -> Path:
-        """Write identification.json into ``folder``, atomically; returns its path.
+    def save(self, folder: str | Path, start_model: str | Path | None = None) -> Path:
+        """Write identification.json into ``folder`` atomically, and return its path.
 
-        ``begun`` is the .tcm file whose cloth was fitted, if it was one: a copy is kept beside it, from which
-        ``diagnosis.start_of`` makes that cloth again.
+        Args:
+            folder: made if it does not exist.
+            start_model: .tcm file whose cloth was fitted, if it was one. A copy is stored next to the result, from
+                which ``diagnosis.start_of`` makes that cloth again.
         """
         folder, content = Path(folder), self.as_dict()
         folder.mkdir(parents=True, exist_ok=True)
-        if begun is not None:
-            with atomically(folder / START) as part:
-                shutil.copyfile(begun, part)
-            content["model"] = content["model"] | {"begun": START}
-        return write_text(folder / "identification.json", json.dumps(content, indent=1, allow_nan=False) + "\n")
+        if start_model is not None:
+            with write_atomically(folder / START_MODEL_FILE_NAME) as part:
+                shutil.copyfile(start_model, part)
+            content["model"] = content["model"] | {"start_model": START_MODEL_FILE_NAME}
+        return write_text(folder / IDENTIFICATION_FILE_NAME, json.dumps(content, indent=1, allow_nan=False) + "\n")
 
     def apply(self, cloth: Cloth) -> Cloth:
-        """Set the fitted values in ``cloth``, leaving what is not identifiable as it is; returns it."""
-        return set_identified(cloth, self.keys, self.parameters)
+        """Set the identified values in ``cloth``, leave the others as they are, and return it."""
+        return set_identifiable(cloth, self.keys, self.parameters)
 
 
-def or_none(value: float) -> float | None:
-    """What was not measured is null in JSON."""
+def nan_to_none(value: float) -> float | None:
+    """Replace NaN, which stands for what was not measured, by None, which is null in JSON."""
     return None if math.isnan(value) else value
 
 
-def set_identified(cloth: Cloth, keys: Mapping[str, str], parameters: Mapping[str, Estimate]) -> Cloth:
-    """Set what is identifiable in ``cloth``; ``keys``: parameter name -> module path."""
+def set_identifiable(cloth: Cloth, keys: Mapping[str, str], parameters: Mapping[str, Estimate]) -> Cloth:
+    """Set identified values in ``cloth`` and return it.
+
+    Args:
+        cloth: changed in place.
+        keys: module path by parameter name.
+        parameters: estimates by name.
+    """
     for name, path in keys.items():
         if parameters[name].identifiable:
             cloth.get_submodule(path).set(parameters[name].value)  # type: ignore[operator]

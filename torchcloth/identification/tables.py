@@ -1,4 +1,4 @@
-"""A fit as a table for a terminal."""
+"""Print a fit as tables for a terminal."""
 
 from __future__ import annotations
 
@@ -12,7 +12,8 @@ from .uncertainty.estimates import Estimate
 if TYPE_CHECKING:
     from rich.table import Table
 
-COLUMNS = {
+MIN_TABLE_WIDTH = 112  # columns of the terminal
+PARAMETER_COLUMN_SIDES = {
     "parameter": "left",
     "start": "right",
     "fitted": "right",
@@ -21,16 +22,16 @@ COLUMNS = {
     "unit": "left",
     "": "left",
 }
-ERRORS = ("rms_before", "rms_after", "max_after")
-REMARKS = {"prior": "measured", "derived": "= E h", "held fixed": "held fixed"}
+ERROR_KEYS = ("rms_before", "rms_after", "max_after")
+SOURCE_REMARKS = {"prior": "measured", "derived": "= E h", "held fixed": "held fixed"}
 
 
 def print_fit(fit: Identification) -> None:
-    """Parameters, distances and warnings, 112 columns wide or more."""
+    """Print parameters, distances and warnings, 112 columns wide or more."""
     from rich.console import Console
 
     console = Console(highlight=False)
-    console.width = max(console.width, 112)
+    console.width = max(console.width, MIN_TABLE_WIDTH)
     absent = [name for name, e in fit.parameters.items() if e.source == "not in the model"]
     console.print(_parameters(fit.parameters))
     if absent:
@@ -44,14 +45,14 @@ def print_fit(fit: Identification) -> None:
     points = f"{f['points']:.0f} points count as " if f["points"] else ""
     console.print(
         f"{f['iterations']:.0f} iterations{end}, {f['simulations']:.0f} simulations, {f['seconds']:.0f} s; "
-        f"{points}{f['independent_observations']:.0f} independent observations"
+        f"{points}{f['effective_observations']:.0f} effective observations"
     )
     for warning in fit.warnings:
         console.print(f"note: {warning}", style="yellow", markup=False)
 
 
 def _distances(f: dict[str, Any]) -> Table:
-    """Of the null, the start and the end; forces where there are any."""
+    """Distances of the null, the start and the end, and forces where there are any."""
     from rich import box
     from rich.table import Table
 
@@ -80,48 +81,50 @@ def _print_profiles(console, fit: Identification) -> None:
 
 
 def _print_influences(console, fit: Identification) -> None:
-    """How far parameters move the cloth, and what would determine those that are not known."""
+    """Print how far parameters move the cloth, and what would determine those that are not identified."""
     from rich import box
     from rich.table import Table
 
-    table = Table(title="What the data can tell", title_justify="left", box=box.SIMPLE_HEAD)
+    table = Table(title="What the data can determine", title_justify="left", box=box.SIMPLE_HEAD)
     for heading in ("parameter", "10 % moves the cloth by", "its forces by", "to determine it"):
         table.add_column(heading, justify="right" if "by" in heading else "left", no_wrap=heading == "parameter")
     for name, i in fit.influences.items():
-        table.add_row(name, f"{i.tenth_mm:.2g} mm", f"{i.tenth_newton:.2g} N", i.experiment)
+        table.add_row(
+            name, f"{i.displacement_per_10_percent_mm:.2g} mm", f"{i.force_per_10_percent_n:.2g} N", i.experiment
+        )
     if fit.influences:
         console.print(table)
-    known = [c for c in fit.combinations if c.determined]
-    if known:
+    determined = [c for c in fit.combinations if c.determined]
+    if determined:
         console.print(
             "Known together: the data show the product to so many per cent; each of its factors may be less certain."
         )
-    for c in known:
+    for c in determined:
         console.print(f"known together: {c.text}, to {100 * c.std:.2g} %", markup=False)
 
 
 def _print_nuisances(console, fit: Identification) -> None:
-    """What is no property of the fabric, by episode, in as few lines as can be."""
-    for episode, own in fit.nuisances.items():
-        if own:
-            numbers = [f"{name} {e.value:.2g} ± {e.std:.1g} {e.unit}" for name, e in own.items()]
+    """Print the nuisances, one line per episode."""
+    for episode, estimates in fit.nuisances.items():
+        if estimates:
+            numbers = [f"{name} {e.value:.2g} ± {e.std:.1g} {e.unit}" for name, e in estimates.items()]
             console.print(f"{episode}: {', '.join(numbers)}", markup=False)
 
 
 def print_tension(fit: TensionFit) -> None:
-    """Parameters, errors of every table and warnings, 112 columns wide or more."""
+    """Print parameters, errors of every table and warnings, 112 columns wide or more."""
     from rich import box
     from rich.console import Console
     from rich.table import Table
 
     console = Console(highlight=False)
-    console.width = max(console.width, 112)
+    console.width = max(console.width, MIN_TABLE_WIDTH)
     console.print(_parameters(fit.parameters))
     table = Table(title="Errors, % of a table's largest reading", title_justify="left", box=box.SIMPLE_HEAD)
     for heading in ("table", "force rms: start", "fitted", "largest", "lateral strain rms: start", "fitted", "largest"):
         table.add_column(heading, justify="left" if heading == "table" else "right")
     for k, errors in enumerate(fit.errors):
-        keys = [f"{kind}_{figure}" for kind in ("force", "lateral") for figure in ERRORS]
+        keys = [f"{kind}_{figure}" for kind in ("force", "lateral") for figure in ERROR_KEYS]
         table.add_row(str(k), *(f"{100 * errors[key]:.1f}" if key in errors else "" for key in keys))
     console.print(table)
     for warning in fit.warnings:
@@ -129,12 +132,12 @@ def print_tension(fit: TensionFit) -> None:
 
 
 def _parameters(estimates: dict[str, Estimate]) -> Table:
-    """What is in the model."""
+    """Estimates of the parameters that are in the model."""
     from rich import box
     from rich.table import Table
 
     table = Table(title="Parameters", title_justify="left", box=box.SIMPLE_HEAD)
-    for heading, side in COLUMNS.items():
+    for heading, side in PARAMETER_COLUMN_SIDES.items():
         table.add_column(heading, justify=side, no_wrap=True)  # type: ignore[arg-type]
     for name, e in estimates.items():
         if e.source != "not in the model":
@@ -143,7 +146,7 @@ def _parameters(estimates: dict[str, Estimate]) -> Table:
 
 
 def _statement(e: Estimate) -> tuple[str, str, str]:
-    """Value, error, interval: never a number without its error, and no number where the data say nothing."""
+    """(value, error, interval): no number without its error, and none where the data say nothing."""
     interval = f"{e.ci95[0]:.3g} … {e.ci95[1]:.3g}"
     if not e.identifiable:
         return "–", "–", interval
@@ -154,4 +157,4 @@ def _statement(e: Estimate) -> tuple[str, str, str]:
 def _remark(e: Estimate) -> str:
     if e.source in ("data", "prior") and not e.identifiable:
         return "not identifiable"
-    return REMARKS.get(e.source, "")
+    return SOURCE_REMARKS.get(e.source, "")

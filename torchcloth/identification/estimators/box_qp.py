@@ -1,4 +1,4 @@
-"""A step of several unknowns that depend on each other, each within bounds of its own."""
+"""Quadratic programme of several dependent unknowns, each within bounds, by active sets."""
 
 from __future__ import annotations
 
@@ -6,26 +6,28 @@ import torch
 from torch import Tensor
 
 
-def bounded(matrix: Tensor, right: Tensor, low: Tensor, high: Tensor) -> Tensor:
-    """The minimum [K] of ``0.5 s @ matrix @ s - right @ s`` between ``low`` <= 0 and ``high`` >= 0, by active sets.
+def solve_box_qp(matrix: Tensor, right: Tensor, low: Tensor, high: Tensor) -> Tensor:
+    """Return the minimum [K] of ``0.5 s @ matrix @ s - right @ s`` between ``low`` <= 0 and ``high`` >= 0.
 
-    What stays free makes up for what is held at its bound. A solution that is merely cut, one by one, may lead uphill.
+    Free unknowns make up for those at a bound. A solution whose entries are merely clipped may lead uphill.
     """
-    held, step = torch.zeros_like(right, dtype=torch.bool), torch.zeros_like(right)
+    at_bound, step = torch.zeros_like(right, dtype=torch.bool), torch.zeros_like(right)
     for _ in range(10 * len(right)):
-        free, wanted = ~held, step.clone()
-        wanted[free] = torch.linalg.solve(matrix[free][:, free], right[free] - matrix[free][:, held] @ step[held])
-        beyond = (wanted < low) | (wanted > high)
-        if bool(beyond.any()):  # as far as the first bound
-            share = torch.where(beyond, (wanted.clamp(low, high) - step) / (wanted - step), torch.inf)
-            first = int(share.argmin())
-            step = step + share[first] * (wanted - step)
-            step[first], held[first] = wanted.clamp(low, high)[first], True
+        free, target = ~at_bound, step.clone()
+        coupling = matrix[free][:, at_bound] @ step[at_bound]
+        target[free] = torch.linalg.solve(matrix[free][:, free], right[free] - coupling)
+        outside = (target < low) | (target > high)
+        if bool(outside.any()):  # go as far as the first bound
+            fraction = torch.where(outside, (target.clamp(low, high) - step) / (target - step), torch.inf)
+            first = int(fraction.argmin())
+            step = step + fraction[first] * (target - step)
+            step[first], at_bound[first] = target.clamp(low, high)[first], True
             continue
-        step, slope = wanted, matrix @ wanted - right
-        pressing = held & (torch.where(step <= low, -slope, slope) > 0) & (low < high)  # inwards, from its bound
-        if not bool(pressing.any()):
+        step, gradient = target, matrix @ target - right
+        points_inwards = torch.where(step <= low, -gradient, gradient) > 0
+        releasable = at_bound & points_inwards & (low < high)
+        if not bool(releasable.any()):
             break
-        gain = slope.square() / matrix.diagonal()
-        held[int(torch.where(pressing, gain, -torch.inf).argmax())] = False
+        gain = gradient.square() / matrix.diagonal()
+        at_bound[int(torch.where(releasable, gain, -torch.inf).argmax())] = False
     return step.clamp(low, high)

@@ -1,46 +1,73 @@
-"""Whether a search that did not converge ended near enough to say something.
+"""Whether a search that did not converge ended near enough to the optimum to say something.
 
-Where it ended at the noise, only flat directions are left, and their errors are widened by the way that is left. Where
-it ended far off, slopes of there say nothing about the optimum, and errors made of them are far too small.
+A search that ended at the noise has only flat directions left. Their errors are widened by the distance that remains.
+Slopes at an end that is far off say nothing about the optimum, and errors computed from them are far too small.
 """
 
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 
 from . import levenberg_marquardt
-from .box_qp import bounded
-from .linearity import Checked
+from .box_qp import solve_box_qp
+from .linearity import LinearityCheck
 from .objective import Objective
 
-OFF = 1.3  # of the sensor's noise: searches cut short ended at 0.3 to 1.2 (errors that held), or at 1.4 to 6
-FAR = 10.0  # standard deviations of a prior, beyond which nothing is looked for
-LOST = 10.0  # standard errors: likewise 0.1 to 4, seldom up to 17, or 12 to 100
+
+@dataclass(frozen=True)
+class ConvergenceCriteria:
+    """When the end of an unfinished search may be an estimate.
+
+    Attributes:
+        max_residual_over_noise: rms residual over the sensor noise. Searches that were cut short ended at 0.3 to 1.2,
+            with errors that held, or at 1.4 to 6.
+        max_prior_stds: standard deviations of the prior within which the remaining step is sought.
+        max_remaining_std_errors: standard errors to the predicted optimum. Searches that were cut short ended at 0.1
+            to 4, seldom up to 17, or at 12 to 100.
+    """
+
+    max_residual_over_noise: float = 1.3
+    max_prior_stds: float = 10.0
+    max_remaining_std_errors: float = 10.0
 
 
-def astray(objective: Objective, checked: Checked) -> str:
-    """Why the end of an unfinished search is no estimate; empty where it may be one.
+CONVERGENCE_CRITERIA = ConvergenceCriteria()
 
-    By the residual where the noise of what was used is known, else by how far the slopes would go on.
+
+def find_failure_reason(
+    objective: Objective, checked: LinearityCheck, criteria: ConvergenceCriteria = CONVERGENCE_CRITERIA
+) -> str:
+    """Return why the end of an unfinished search is no estimate; empty where it may be one.
+
+    The residual decides where the sensor noise is known. Otherwise the distance decides that the slopes still ask for.
 
     Args:
-        objective: of the frames that told it.
-        checked: where it ended.
+        objective: of the frames that were used.
+        checked: where the search ended.
+        criteria: the limits.
     """
-    seen = objective.episodes if objective.uses("points", "markers") else []
-    noise = max((e.noise for e in seen if e.noise), default=math.nan)
-    times = objective.figures(checked.final.raw).rms / noise
-    if math.isfinite(times):
-        return f"the residual is {times:.1f} times the sensor noise" if times > OFF else ""
-    if checked.covariance is not None:  # its slopes are not all that told it
+    episodes = objective.episodes if objective.uses("points", "markers") else []
+    noise = max((e.noise_std for e in episodes if e.noise_std), default=math.nan)
+    ratio = objective.distance_metrics(checked.final.raw).rms / noise
+    if math.isfinite(ratio):
+        is_off = ratio > criteria.max_residual_over_noise
+        return f"the residual is {ratio:.1f} times the sensor noise" if is_off else ""
+    if checked.covariance is not None:  # the slopes do not cover all data that were used
         return ""
-    left = way_left(objective.problem(), checked.final)
-    return f"its slopes lead {left:.0f} standard errors farther" if left > LOST else ""
+    remaining = remaining_std_errors(objective.problem(), checked.final, criteria)
+    is_far = remaining > criteria.max_remaining_std_errors
+    return f"its slopes lead {remaining:.0f} standard errors farther" if is_far else ""
 
 
-def way_left(problem: levenberg_marquardt.Problem, at: levenberg_marquardt.Iterate) -> float:
-    """Standard errors to where the slopes put the minimum, by how much lower the cost would be there."""
+def remaining_std_errors(
+    problem: levenberg_marquardt.Problem,
+    at: levenberg_marquardt.Iterate,
+    criteria: ConvergenceCriteria = CONVERGENCE_CRITERIA,
+) -> float:
+    """Return the standard errors to the minimum that the slopes predict, from the decrease of the cost there."""
     gradient, hessian = levenberg_marquardt.normal_equations(problem, at)
-    low, high = (problem.clip(at.raw + sign * FAR * problem.prior_std) - at.raw for sign in (-1, 1))
-    step = bounded(hessian, -gradient, low, high)
+    reach = criteria.max_prior_stds * problem.prior_std
+    low, high = (problem.clip(at.raw + sign * reach) - at.raw for sign in (-1, 1))
+    step = solve_box_qp(hessian, -gradient, low, high)
     return max(0.0, -float(2 * gradient @ step + step @ hessian @ step)) ** 0.5

@@ -1,76 +1,113 @@
-"""Whether the derivatives at the solution hold over a standard error."""
+"""Check whether the derivatives at a solution hold over a standard error."""
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-from ..uncertainty.identifiability import Reach
+from ..uncertainty.identifiability import ParameterInfluence
 from . import levenberg_marquardt
 from .objective import Objective
 
-NONLINEAR = 0.5  # relative error of the tangents over a finite step above which they are not used for errors
-CURVED = 0.2  # the same over a standard error, from which an interval is noticeably longer to one side
-RUNAWAY = 1.0  # sizes of the cloth
-NOTICED = 0.3  # standard deviations of all data together: what moves them less can mislead no error bar
-SMALLEST, LARGEST = 0.005, 0.1  # finite steps, in units of the prior's standard deviation
+
+@dataclass(frozen=True)
+class LinearityCriteria:
+    """When tangents describe the motion.
+
+    Attributes:
+        max_relative_error: relative error of the tangents over a finite step above which errors do not use them.
+        min_skew_error: the same error over one standard error, from which an interval is noticeably longer on one side.
+        max_displacement_extents: displacement by a longest step, in extents of the cloth, above which tangents describe
+            no motion.
+        min_noticeable_stds: change of all data together, in standard deviations, below which a wrong slope can mislead
+            no error bar.
+        min_step_prior_stds: shortest finite step, in standard deviations of the prior.
+        max_step_prior_stds: longest finite step, in standard deviations of the prior.
+    """
+
+    max_relative_error: float = 0.5
+    min_skew_error: float = 0.2
+    max_displacement_extents: float = 1.0
+    min_noticeable_stds: float = 0.3
+    min_step_prior_stds: float = 0.005
+    max_step_prior_stds: float = 0.1
 
 
-class Checked(NamedTuple):
-    """A solution whose derivatives hold, or have been replaced."""
+LINEARITY_CRITERIA = LinearityCriteria()
+
+
+class LinearityCheck(NamedTuple):
+    """A solution whose derivatives hold, or have been replaced.
+
+    Attributes:
+        final: the solution.
+        influence: how far each unknown moves the cloth.
+        warnings: what a reader should know, in sentences.
+        curved_parameters: names of unknowns whose interval may be skew.
+        failure_reason: why tangents are of no use here. Empty where they are.
+        covariance: [K, K] of the estimate, where it does not follow from the tangents.
+    """
 
     final: levenberg_marquardt.Iterate
-    reach: Reach
+    influence: ParameterInfluence
     warnings: list[str]
-    curved: list[str]  # unknowns whose interval may be skew
-    reason: str = ""  # why tangents are of no use here; empty where they are
-    covariance: Tensor | None = None  # [K, K] of the estimate, where it is not that of the tangents
+    curved_parameters: list[str]
+    failure_reason: str = ""
+    covariance: Tensor | None = None
 
     @property
-    def withdrawn(self) -> bool:
+    def is_withdrawn(self) -> bool:
         """Whether no parameter counts as identified."""
-        return bool(self.reason)
+        return bool(self.failure_reason)
 
 
-def check(objective: Objective, final: levenberg_marquardt.Iterate) -> Checked:
-    """Compare the tangents with finite steps of about a standard error; where they fail, differences replace them.
+def check_linearity(
+    objective: Objective, final: levenberg_marquardt.Iterate, criteria: LinearityCriteria = LINEARITY_CRITERIA
+) -> LinearityCheck:
+    """Compare the tangents with finite steps of about a standard error, and replace those that fail by differences.
 
-    Tangents are exact, but where the motion is unstable they describe a neighbourhood too small to matter.
+    Tangents are exact. Where the motion is unstable they describe a neighbourhood that is too small to matter.
     """
     prior = objective.problem().prior_std
     deviation = torch.zeros_like(prior)
-    if not runaway(objective, final):  # else their covariance is none
-        found = levenberg_marquardt.covariance(objective.problem(), final).diagonal().sqrt()
-        deviation = torch.where(found.isfinite(), found, 0.0)  # else slopes that overflow: the smallest steps
-    steps = torch.minimum(torch.maximum(deviation, SMALLEST * prior), LARGEST * prior)[: len(objective.unknowns)]
-    secants, reach = objective.secants(final.raw, steps)
-    weight = final.influence()[0].sqrt()[:, None]
-    moved, slope = (weight * j[:, : len(steps)] for j in (secants.jacobian, final.linear.jacobian))
-    missed = (moved - slope).norm(dim=0) / moved.norm(dim=0).clamp(min=1e-12)
-    noticed = ~(torch.maximum(moved.norm(dim=0), slope.norm(dim=0)) * steps < NOTICED)
-    missed = torch.where(missed.isfinite(), missed, torch.inf)  # slopes that overflow say nothing
-    missed = torch.where(noticed, missed, 0.0)
-    if float(missed.max()) < NONLINEAR:
-        over_one = missed * deviation[: len(steps)] / steps
-        curved = [u.name for u, error in zip(objective.unknowns, over_one, strict=True) if error >= CURVED]
-        return Checked(final, reach, [], curved)
-    names = ", ".join(u.name for u, error in zip(objective.unknowns, missed, strict=True) if error >= NONLINEAR)
+    if not has_runaway_tangents(objective, final, criteria):  # else they give no covariance
+        std = levenberg_marquardt.covariance(objective.problem(), final).diagonal().sqrt()
+        deviation = torch.where(std.isfinite(), std, 0.0)  # where slopes overflow: the shortest steps
+    shortest, longest = criteria.min_step_prior_stds * prior, criteria.max_step_prior_stds * prior
+    steps = torch.minimum(torch.maximum(deviation, shortest), longest)[: len(objective.unknowns)]
+    secants, influence = objective.linearise_by_differences(final.raw, steps)
+    weight = final.row_weights()[0].sqrt()[:, None]
+    secant, tangent = (weight * j[:, : len(steps)] for j in (secants.jacobian, final.linear.jacobian))
+    error = (secant - tangent).norm(dim=0) / secant.norm(dim=0).clamp(min=1e-12)
+    is_noticeable = ~(torch.maximum(secant.norm(dim=0), tangent.norm(dim=0)) * steps < criteria.min_noticeable_stds)
+    error = torch.where(error.isfinite(), error, torch.inf)  # slopes that overflow say nothing
+    error = torch.where(is_noticeable, error, 0.0)
+    if float(error.max()) < criteria.max_relative_error:
+        over_one_std = error * deviation[: len(steps)] / steps
+        pairs = zip(objective.unknowns, over_one_std, strict=True)
+        curved = [u.name for u, skew in pairs if skew >= criteria.min_skew_error]
+        return LinearityCheck(final, influence, [], curved)
+    pairs = zip(objective.unknowns, error, strict=True)
+    names = ", ".join(u.name for u, e in pairs if e >= criteria.max_relative_error)
     reason = (
-        f"the motion is unstable or strongly nonlinear at the solution (tangents of {names} miss finite steps "
-        f"by up to {min(1000.0, 100 * float(missed.max())):.0f} %)"
+        f"the motion is unstable or strongly nonlinear at the solution (tangents of {names} differ from finite steps "
+        f"by up to {min(1000.0, 100 * float(error.max())):.0f} %)"
     )
     warning = f"{reason}: no parameter counts as identified"
-    return Checked(final._replace(linear=secants), reach, [warning], [], reason)
+    return LinearityCheck(final._replace(linear=secants), influence, [warning], [], reason)
 
 
-def runaway(objective: Objective, at: levenberg_marquardt.Iterate) -> bool:
-    """Whether tangents are so long that they describe no motion: a longest step by many times the cloth's size."""
-    seen = torch.tensor([block.unit == "m" for block in objective.blocks])[at.linear.kind]
-    rows = at.linear.jacobian[seen][:, : len(objective.unknowns)]
-    longest = objective.problem().longest[: len(objective.unknowns)]
-    return (
-        bool(len(rows))
-        and not float((rows * longest).square().mean(0).sqrt().max()) <= RUNAWAY * objective.cloth.mesh.extent
-    )
+def has_runaway_tangents(
+    objective: Objective, at: levenberg_marquardt.Iterate, criteria: LinearityCriteria = LINEARITY_CRITERIA
+) -> bool:
+    """Whether tangents are so long that they describe no motion: a longest step moves the cloth by its own size."""
+    is_position = torch.tensor([block.unit == "m" for block in objective.blocks])[at.linear.blocks]
+    rows = at.linear.jacobian[is_position][:, : len(objective.unknowns)]
+    if not len(rows):
+        return False
+    max_step = objective.problem().max_step[: len(objective.unknowns)]
+    displacement = float((rows * max_step).square().mean(0).sqrt().max())
+    return not displacement <= criteria.max_displacement_extents * objective.cloth.mesh.extent  # NaN runs away

@@ -1,4 +1,4 @@
-"""Where a search begins: from several places, so that no answer is that of its start."""
+"""Several starting points of a search, so that the answer does not depend on one of them."""
 
 from __future__ import annotations
 
@@ -8,49 +8,55 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from ...episodes.unknowns import DECADE, Unknown
+from ...episodes.unknowns import LOG_DECADE, Unknown
 from . import levenberg_marquardt
 
-REACH = 1.0  # decades to either side, of a positive parameter; standard deviations of the prior for others
-SAME = 1.0  # standard error within which two answers are one
+START_RANGE_DECADES = 1.0  # to either side, of a positive parameter; prior standard deviations of any other
+MAX_AGREEMENT_STD_ERRORS = 1.0  # distance within which two end points are one answer
 
 
-class Reached(NamedTuple):
-    """What came of several starts."""
+class MultistartResult(NamedTuple):
+    """What several starts led to.
 
-    raw: Tensor  # the best
-    agree: int  # starts that led there, within a standard error in every direction
-    tried: int  # starts that could be simulated
+    Attributes:
+        raw: [K] the best end point.
+        agreeing: number of starts that led there, within a standard error in every direction.
+        simulated: number of starts that could be simulated.
+    """
+
+    raw: Tensor
+    agreeing: int
+    simulated: int
 
 
-def spread(unknowns: Sequence[Unknown], start: Tensor, count: int) -> list[Tensor]:
-    """``count`` starts [K], the given one first, the others evenly over the range of every unknown (Sobol)."""
+def sample_starts(unknowns: Sequence[Unknown], start: Tensor, count: int) -> list[Tensor]:
+    """Return ``count`` starts [K]: the given one, then points spread evenly over every unknown's range (Sobol)."""
     if count == 1:
         return [start]
-    share = torch.quasirandom.SobolEngine(len(unknowns), scramble=True, seed=0).draw(count - 1, dtype=torch.float64)
-    out = [start]
-    for row in share:
+    points = torch.quasirandom.SobolEngine(len(unknowns), scramble=True, seed=0).draw(count - 1, dtype=torch.float64)
+    starts = [start]
+    for point in points:
         raw = start.clone()
         for k, unknown in enumerate(unknowns):
-            width = 0.0 if unknown.measured else _width(unknown)
-            raw[k] = unknown.clip(float(start[k] + width * (2 * row[k] - 1)))
-        out.append(raw)
-    return out
+            half_range = 0.0 if unknown.measured else _half_range(unknown)
+            raw[k] = unknown.clip(float(start[k] + half_range * (2 * point[k] - 1)))
+        starts.append(raw)
+    return starts
 
 
-def _width(unknown: Unknown) -> float:
+def _half_range(unknown: Unknown) -> float:
     if unknown.parameter.domain == "positive":
-        return REACH * DECADE
-    return REACH * unknown.prior_std
+        return START_RANGE_DECADES * LOG_DECADE
+    return START_RANGE_DECADES * unknown.prior_std
 
 
-def best(problem: levenberg_marquardt.Problem, found: Sequence[levenberg_marquardt.Iterate]) -> Reached:
-    """The end point of least robust cost, measured by the same scales for all."""
-    judge = min(found, key=lambda at: float(at.scale.log().sum()))  # explains most: its noise is the smallest
-    costs = [levenberg_marquardt.cost(problem, judge, at.raw, at.linear.value) for at in found]
-    winner = found[costs.index(min(costs))]
-    hessian = torch.linalg.pinv(
-        levenberg_marquardt.covariance(problem, winner), hermitian=True
-    )  # chaos leaves it singular
-    away = [max(float((at.raw - winner.raw) @ hessian @ (at.raw - winner.raw)), 0.0) ** 0.5 for at in found]
-    return Reached(winner.raw, sum(d <= SAME for d in away), len(found))
+def select_best(problem: levenberg_marquardt.Problem, ends: Sequence[levenberg_marquardt.Iterate]) -> MultistartResult:
+    """Return the end point of least robust cost, with the same noise scales for all."""
+    reference = min(ends, key=lambda at: float(at.scale.log().sum()))  # smallest noise: it explains most
+    costs = [levenberg_marquardt.robust_cost(problem, reference, at.raw, at.linear.residual) for at in ends]
+    best = ends[costs.index(min(costs))]
+    # chaos leaves the covariance singular
+    precision = torch.linalg.pinv(levenberg_marquardt.covariance(problem, best), hermitian=True)
+    offsets = [at.raw - best.raw for at in ends]
+    distances = [max(float(offset @ precision @ offset), 0.0) ** 0.5 for offset in offsets]
+    return MultistartResult(best.raw, sum(d <= MAX_AGREEMENT_STD_ERRORS for d in distances), len(ends))

@@ -10,30 +10,53 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from ..._utils.resume import Journal, digest
+from ..._utils.resume import ResumableStore, digest
 from ...cloth import Cloth
-from ...episodes.cloth_facts import facts_of
+from ...episodes.cloth_fingerprint import cloth_fingerprint_parts
 from ...episodes.observed import Episode
-from ...episodes.observed_surface import sheet_for
-from ...episodes.replay import Frames, each, simulate, tangents
+from ...episodes.observed_surface import build_surface
+from ...episodes.replay import Frames, map_frames, simulate, simulate_with_tangents
 from ...episodes.unknowns import Unknown
 from ...errors import InvalidInput, SimulationDiverged, UnstableStep
 from ...parameters import PhysicalParameter
-from ..nuisances import AbstractNuisance, Placed, foreseen, place
-from ..residuals.blocks import BLOCKS, USES, Block, floors_of
-from ..residuals.metrics import Figures, figures, forces_rms, huber
-from ..residuals.rows import Rows, scene_of
-from ..uncertainty.identifiability import Reach
+from ..nuisances import AbstractNuisance, NuisanceSlice, add_lookahead, place_nuisances
+from ..residuals.blocks import BLOCKS, BLOCKS_BY_DATA_KIND, Block, check_noise_floors
+from ..residuals.metrics import DistanceMetrics, distance_metrics, force_rms, huber
+from ..residuals.rows import ResidualRows, match_points
+from ..uncertainty.identifiability import ParameterInfluence
 from . import levenberg_marquardt
+from .levenberg_marquardt import DEFAULT_NOISE_MODEL, NoiseModelSettings
+
+MAX_REMEMBERED_POINTS = 4  # whose simulated frames are kept in memory
 
 
 class Objective:
-    """Residuals and simulated frames as functions of the unknowns; counts simulations.
+    """Residuals and simulated frames as functions of the unknowns; it counts simulations.
 
-    The vector of unknowns holds the fabric's first, then the nuisances of one episode after the other.
+    The vector of unknowns [K] holds the fabric's, then the nuisances of one episode after the other.
+
+    Args:
+        cloth: the model.
+        unknowns: the fabric's unknowns.
+        episodes: what drives the cloth and what was observed.
+        dt: largest substep [s]; None: the stable one.
+        nuisances: what differs from episode to episode.
+        blocks: kinds of data in use.
+        noise_floors: least standard deviation by block name; None: the blocks' own.
+
+    Attributes:
+        start: [K] unconstrained start values.
+        prior_mean: [K].
+        prior_std: [K].
+        typical_changes: [K] changes of the unknowns that matter.
+        surface: the cloth's surface as data see it.
+        nuisance_slices: for every episode, where its nuisances stand in the vector of unknowns.
+        journal: store of earlier answers, or None.
+        simulations: number of simulated episodes so far; one tangent counts as one.
     """
 
-    patience = 1  # iterations that may bring nothing, of a search by gradients
+    patience = 1  # iterations without progress that a search by gradients may make
+    noise_model: NoiseModelSettings = DEFAULT_NOISE_MODEL
 
     def __init__(
         self,
@@ -43,237 +66,262 @@ class Objective:
         dt: float | None = None,
         nuisances: Sequence[AbstractNuisance] = (),
         blocks: Sequence[Block] = BLOCKS,
-        floors: Mapping[str, float] | None = None,
+        noise_floors: Mapping[str, float] | None = None,
     ) -> None:
         self.cloth, self.unknowns, self.episodes, self.dt = cloth, list(unknowns), list(episodes), dt
-        self.nuisances, self.blocks, self.floors = list(nuisances), list(blocks), floors_of(floors)
-        self.sheet = sheet_for(cloth, self.episodes)
-        self.faces = self.sheet.faces
-        self.placed = place(self.nuisances, cloth, self.episodes, len(self.unknowns))
-        stds = [std for own in self.placed for p in own for std in p.stds]
+        self.nuisances, self.blocks = list(nuisances), list(blocks)
+        self.noise_floors = check_noise_floors(noise_floors)
+        self.surface = build_surface(cloth, self.episodes)
+        self.faces = self.surface.faces
+        self.nuisance_slices = place_nuisances(self.nuisances, cloth, self.episodes, len(self.unknowns))
+        stds = [std for slices in self.nuisance_slices for s in slices for std in s.stds]
+        zeros = [0.0 for _ in stds]
         self.prior_std = torch.tensor([*(u.prior_std for u in unknowns), *stds], dtype=torch.float64)
-        self.sizes = torch.tensor([*(u.size for u in unknowns), *stds], dtype=torch.float64)
-        self.start = torch.tensor([*(u.start for u in unknowns), *(0.0 for _ in stds)], dtype=torch.float64)
-        self.middle = torch.tensor([*(u.middle for u in unknowns), *(0.0 for _ in stds)], dtype=torch.float64)
-        self.journal: Journal | None = None
+        self.typical_changes = torch.tensor([*(u.typical_change for u in unknowns), *stds], dtype=torch.float64)
+        self.start = torch.tensor([*(u.start for u in unknowns), *zeros], dtype=torch.float64)
+        self.prior_mean = torch.tensor([*(u.prior_mean for u in unknowns), *zeros], dtype=torch.float64)
+        self.journal: ResumableStore | None = None
         self.simulations = 0
-        self._met: set[tuple[float, ...]] = set()
-        self._recent: dict[tuple[float, ...], list[Frames]] = {}
+        self._counted_points: set[tuple[float, ...]] = set()
+        self._recent_frames: dict[tuple[float, ...], list[Frames]] = {}
 
-    def part(self, share: float) -> Objective:
-        """The same for the first ``share`` of the frames."""
-        return self._like(foreseen([e.until(share) for e in self.episodes], self.nuisances), self.nuisances)
+    def first_fraction(self, fraction: float) -> Objective:
+        """Return the objective of the first ``fraction`` of the frames."""
+        episodes = [e.first_fraction(fraction) for e in self.episodes]
+        return self._with_episodes(add_lookahead(episodes, self.nuisances), self.nuisances)
+
+    def with_nuisances(self, nuisances: Sequence[AbstractNuisance]) -> Objective:
+        """Return the objective with other nuisances."""
+        return self._with_episodes(self.episodes, nuisances)
+
+    def _with_episodes(self, episodes: Sequence[Episode], nuisances: Sequence[AbstractNuisance]) -> Objective:
+        other = Objective(self.cloth, self.unknowns, episodes, self.dt, nuisances, self.blocks, self.noise_floors)
+        other.journal = self.journal
+        return other
 
     @property
-    def told(self) -> bool:
-        """Whether there are any data of the kinds in use."""
-        of = {
+    def has_data(self) -> bool:
+        """Whether there are data of the kinds in use."""
+        tests = {
             "points": lambda e: any(len(cloud) for cloud in e.clouds[1:]),
             "markers": lambda e: e.markers is not None and bool(e.markers[1:].isfinite().any()),
             "force": lambda e: any(bool(w[1:].isfinite().any()) for w in e.wrenches.values()),
         }
-        return any(there(e) for kind, there in of.items() if self.uses(kind) for e in self.episodes)
+        return any(has_kind(e) for kind, has_kind in tests.items() if self.uses(kind) for e in self.episodes)
 
     def uses(self, *kinds: str) -> bool:
-        """Whether data of one of these kinds (of ``USES``) are asked for."""
-        return not {block.name for block in self.blocks}.isdisjoint(name for kind in kinds for name in USES[kind])
-
-    def beside(self, nuisances: Sequence[AbstractNuisance]) -> Objective:
-        """The same with other nuisances."""
-        return self._like(self.episodes, nuisances)
-
-    def _like(self, episodes: Sequence[Episode], nuisances: Sequence[AbstractNuisance]) -> Objective:
-        other = Objective(self.cloth, self.unknowns, episodes, self.dt, nuisances, self.blocks, self.floors)
-        other.journal = self.journal
-        return other
+        """Tell whether data of one of these kinds (keys of ``BLOCKS_BY_DATA_KIND``) are in use."""
+        names = {name for kind in kinds for name in BLOCKS_BY_DATA_KIND[kind]}
+        return not {block.name for block in self.blocks}.isdisjoint(names)
 
     def problem(self) -> levenberg_marquardt.Problem:
-        """The callbacks of Gauss-Newton."""
-        longest = [*(u.longest_step for u in self.unknowns), *self.prior_std[len(self.unknowns) :].tolist()]
+        """Return the callbacks of the Levenberg-Marquardt solver."""
+        max_step = [*(u.max_step for u in self.unknowns), *self.prior_std[len(self.unknowns) :].tolist()]
         return levenberg_marquardt.Problem(
             linearise=self.linearise,
             evaluate=self.evaluate,
             clip=self.clip,
-            prior_mean=self.middle,
+            prior_mean=self.prior_mean,
             prior_std=self.prior_std,
-            longest=torch.tensor(longest, dtype=torch.float64),
-            noise=torch.tensor([self.floor(block) for block in self.blocks], dtype=torch.float64),
-            gate=torch.tensor([block.gate for block in self.blocks], dtype=torch.float64),
+            max_step=torch.tensor(max_step, dtype=torch.float64),
+            noise_floor=torch.tensor([self.noise_floor(block) for block in self.blocks], dtype=torch.float64),
+            outlier_distance=torch.tensor([block.outlier_distance for block in self.blocks], dtype=torch.float64),
+            noise_model=self.noise_model,
         )
 
-    def floor(self, block: Block) -> float:
-        """Least standard deviation of a residual of this kind."""
-        noises = [e.noise for e in self.episodes if e.noise is not None]
-        stated = max(noises) if noises and block.name == "points" else block.floor
-        return self.floors.get(block.name, stated)
+    def noise_floor(self, block: Block) -> float:
+        """Return the least standard deviation of a residual of this kind, in the block's unit."""
+        stds = [e.noise_std for e in self.episodes if e.noise_std is not None]
+        stated = max(stds) if stds and block.name == "points" else block.noise_floor
+        return self.noise_floors.get(block.name, stated)
 
     def clip(self, raw: Tensor) -> Tensor:
-        """The nearest legal point."""
+        """Return the nearest legal point [K]."""
         legal = [u.clip(float(r)) for u, r in zip(self.unknowns, raw, strict=False)]
         return torch.cat([torch.tensor(legal, dtype=raw.dtype), raw[len(legal) :]])
 
-    def raw(self, values: Mapping[str, float]) -> Tensor:
-        """Unconstrained start with some values by name replaced; unknown names are refused."""
-        known = {u.name: i for i, u in enumerate(self.unknowns)}
+    def start_with(self, values: Mapping[str, float]) -> Tensor:
+        """Return the unconstrained start [K] with some physical values replaced, by parameter name.
+
+        Raises:
+            InvalidInput: a name that is not fitted.
+        """
+        index = {u.name: i for i, u in enumerate(self.unknowns)}
         out = self.start.clone()
         for name, value in values.items():
-            if name not in known:
-                raise InvalidInput("guess", got=repr(name), expected=f"one of {', '.join(known)}")
-            parameter = self.unknowns[known[name]].parameter
-            out[known[name]] = PhysicalParameter(value, parameter.unit, parameter.domain, name=name).raw.detach()
+            if name not in index:
+                raise InvalidInput("guess", got=repr(name), expected=f"one of {', '.join(index)}")
+            parameter = self.unknowns[index[name]].parameter
+            out[index[name]] = PhysicalParameter(value, parameter.unit, parameter.domain, name=name).raw.detach()
         return out
 
-    def scaled(self, raw: Tensor) -> Tensor:
-        """In units of the priors' standard deviations, from their middle."""
-        return (raw - self.middle) / self.prior_std
+    def to_scaled(self, raw: Tensor) -> Tensor:
+        """Convert unknowns [K] to standard deviations from the priors' means."""
+        return (raw - self.prior_mean) / self.prior_std
 
-    def unscaled(self, z: Tensor) -> Tensor:
-        """The inverse of ``scaled``."""
-        return self.middle + self.prior_std * z
+    def from_scaled(self, z: Tensor) -> Tensor:
+        """Convert standard deviations from the priors' means [K] back to unknowns."""
+        return self.prior_mean + self.prior_std * z
 
-    def pulled(self, slope: Tensor) -> Tensor:
-        """A gradient by the scaled unknowns from one by the unknowns."""
-        return slope * self.prior_std
+    def scale_gradient(self, gradient: Tensor) -> Tensor:
+        """Convert a gradient [K] by the unknowns to one by the scaled unknowns."""
+        return gradient * self.prior_std
 
-    def values(self, raw: Tensor) -> dict[str, float]:
-        """Physical values of the fabric's unknowns by name."""
+    def physical_values(self, raw: Tensor) -> dict[str, float]:
+        """Return the physical values of the fabric's unknowns by name."""
         return {u.name: u.value(float(r)) for u, r in zip(self.unknowns, raw, strict=False)}
 
-    def identity(self) -> list[object]:
-        """What the answers to the solvers' questions depend on."""
-        data = [part for e in self.episodes for part in e.identity()]
-        model = [*facts_of(self.cloth), self.dt]
+    def fingerprint_parts(self) -> list[object]:
+        """List everything that answers to the solvers' questions depend on."""
+        data = [part for e in self.episodes for part in e.fingerprint_parts()]
+        model = [*cloth_fingerprint_parts(self.cloth), self.dt]
         names = [u.name for u in self.unknowns], [b.name for b in self.blocks], [n.name for n in self.nuisances]
-        return [*data, *model, *names, self.floors, self.middle, self.prior_std]
+        return [*data, *model, *names, self.noise_floors, self.prior_mean, self.prior_std]
 
-    def episode_of(self, linear: levenberg_marquardt.Linearised) -> Tensor:
-        """[R] which episode a row belongs to."""
-        ends = torch.tensor([len(e.times) + levenberg_marquardt.WINDOW for e in self.episodes]).cumsum(0)
-        return torch.searchsorted(ends, linear.frame, right=True)
+    def episode_of_rows(self, linear: levenberg_marquardt.Linearised) -> Tensor:
+        """Return the index [R] of the episode that each row belongs to."""
+        return torch.searchsorted(self._frame_ends(), linear.frame, right=True)
+
+    def _frame_ends(self) -> Tensor:
+        """[E] first frame number after each episode; time blocks do not reach across episodes."""
+        gap = self.noise_model.frames_per_time_block
+        return torch.tensor([len(e.times) + gap for e in self.episodes]).cumsum(0)
 
     # -- simulation -----------------------------------------------------------------------------------------------
 
-    def frames(self, raw: Tensor) -> list[Tensor]:
-        """Frames [T, V, 3] m of every episode as they are seen."""
-        return [frames.x for frames in self.seen(raw)]
+    def simulate_vertices(self, raw: Tensor) -> list[Tensor]:
+        """Simulate the vertices [T, V, 3] m of every episode, as they are observed."""
+        return [frames.x for frames in self.observe(raw)]
 
-    def seen(self, raw: Tensor) -> list[Frames]:
-        """What is seen and felt of every episode; the last few points are remembered."""
-        self._meet(raw)
+    def observe(self, raw: Tensor) -> list[Frames]:
+        """Simulate what is observed of every episode; the last few points are remembered."""
+        self._count_simulations(raw)
         key = tuple(raw.tolist())
-        if key not in self._recent:
+        if key not in self._recent_frames:
             with torch.no_grad():
-                self._recent[key] = [self.simulate(raw, i) for i in range(len(self.episodes))]
-            while len(self._recent) > 4:
-                del self._recent[next(iter(self._recent))]
-        return self._recent[key]
+                self._recent_frames[key] = [self.simulate(raw, i) for i in range(len(self.episodes))]
+            while len(self._recent_frames) > MAX_REMEMBERED_POINTS:
+                del self._recent_frames[next(iter(self._recent_frames))]
+        return self._recent_frames[key]
 
-    def _meet(self, raw: Tensor) -> None:
-        """Count a point once, whether its answer is computed or found in the journal: a resumed fit counts the same."""
+    def _count_simulations(self, raw: Tensor) -> None:
+        """Count a point once, whether it is simulated or read from the journal: a resumed fit counts the same."""
         key = tuple(raw.tolist())
-        if key not in self._met:
-            self._met.add(key)
+        if key not in self._counted_points:
+            self._counted_points.add(key)
             self.simulations += len(self.episodes)
 
     def simulate(self, raw: Tensor, i: int) -> Frames:
-        """One episode; differentiable in reverse mode when ``raw`` requires grad."""
-        fabric, episode = raw[: len(self.unknowns)], self._begun(raw, i)
+        """Simulate episode ``i``; differentiable in reverse mode when ``raw`` [K] requires grad."""
+        fabric, episode = raw[: len(self.unknowns)], self._initial_episode(raw, i)
         frames = simulate(self.cloth, self.unknowns, fabric, episode, self.dt)
-        for p in self.placed[i]:
-            frames = p.nuisance.see(frames, raw[p.where].to(frames.x), self.episodes[i])
+        for s in self.nuisance_slices[i]:
+            frames = s.nuisance.observe(frames, raw[s.index].to(frames.x), self.episodes[i])
         return frames
 
-    def _modes(self, i: int) -> list[tuple[slice, Tensor]]:
-        found = ((p.where, p.nuisance.modes(self.cloth, self.episodes[i])) for p in self.placed[i])
-        return [(where, modes) for where, modes in found if modes is not None]
+    def _initial_shape_modes(self, i: int) -> list[tuple[slice, Tensor]]:
+        modes = (
+            (s.index, s.nuisance.initial_shape_modes(self.cloth, self.episodes[i])) for s in self.nuisance_slices[i]
+        )
+        return [(index, m) for index, m in modes if m is not None]
 
-    def _begun(self, raw: Tensor, i: int) -> Episode:
-        """The episode with its first shape as the nuisances have it."""
+    def _initial_episode(self, raw: Tensor, i: int) -> Episode:
+        """The episode with its first shape moved by the nuisances."""
         episode = self.episodes[i]
-        for where, modes in self._modes(i):
-            shift = torch.einsum("k,kvc->vc", raw[where].to(modes), modes)
+        for index, modes in self._initial_shape_modes(i):
+            shift = torch.einsum("k,kvc->vc", raw[index].to(modes), modes)
             episode = replace(episode, initial=episode.initial + shift)
         return episode
 
     def _tangents(self, raw: Tensor, i: int) -> tuple[Frames, Frames]:
         """One episode, and its derivatives by all unknowns."""
-        own, episode = self._modes(i), self._begun(raw, i)
-        modes = torch.cat([m for _, m in own]) if own else None
+        placed_modes, episode = self._initial_shape_modes(i), self._initial_episode(raw, i)
+        modes = torch.cat([m for _, m in placed_modes]) if placed_modes else None
         fabric = raw[: len(self.unknowns)]
-        frames, few = tangents(self.cloth, self.unknowns, fabric, episode, self.dt, modes)
-        index = [*range(len(self.unknowns)), *(k for where, _ in own for k in range(where.start, where.stop))]
-        moved = each(few, lambda d: d.new_zeros(len(raw), *d.shape[1:]).index_copy(0, torch.tensor(index), d))
-        for p in self.placed[i]:
-            frames, moved = pushed(p, frames, moved, raw, self.episodes[i])
-        return frames, moved
+        frames, computed = simulate_with_tangents(self.cloth, self.unknowns, fabric, episode, self.dt, modes)
+        mode_columns = [k for index, _ in placed_modes for k in range(index.start, index.stop)]
+        columns = torch.tensor([*range(len(self.unknowns)), *mode_columns])
+
+        def spread(d: Tensor) -> Tensor:
+            return d.new_zeros(len(raw), *d.shape[1:]).index_copy(0, columns, d)
+
+        derivatives = map_frames(computed, spread)
+        for s in self.nuisance_slices[i]:
+            frames, derivatives = apply_nuisance(s, frames, derivatives, raw, self.episodes[i])
+        return frames, derivatives
 
     # -- residuals ------------------------------------------------------------------------------------------------
 
     def evaluate(self, raw: Tensor) -> tuple[Tensor, Tensor]:
-        """Residual rows and their patches."""
+        """Compute the residuals [R] and their error groups [R]."""
         rows = self.evaluate_all(raw)
-        return rows.value, rows.patch
+        return rows.residual, rows.error_group
 
     def evaluate_all(self, raw: Tensor) -> levenberg_marquardt.Linearised:
-        """Residual rows without derivatives."""
-        self._meet(raw)
-        work = lambda: self._rows([(frames, None) for frames in self.seen(raw)])  # noqa: E731
-        return levenberg_marquardt.Linearised(*self._ask("evaluate", raw, work))
+        """Compute residual rows without derivatives."""
+        self._count_simulations(raw)
+        rows = self._recall("evaluate", raw, lambda: self._rows([(frames, None) for frames in self.observe(raw)]))
+        return levenberg_marquardt.Linearised(*rows)
 
     def linearise(self, raw: Tensor) -> levenberg_marquardt.Linearised:
-        """Residual rows with exact sensitivities, by forward mode through the whole simulation.
+        """Compute residual rows with exact sensitivities, by forward mode through the whole simulation.
 
-        Its frames are not remembered: their last digits are not those of a simulation alone, and a resumed fit, which
-        recalls either, would then differ in the last digit.
+        Its frames are not remembered. Their last digits differ from those of a simulation without tangents, so a
+        resumed fit, which recalls either, would differ in the last digit.
         """
-        work = lambda: self._rows([self._tangents(raw, i) for i in range(len(self.episodes))])  # noqa: E731
-        self._meet(raw)
+        episodes = range(len(self.episodes))
+        self._count_simulations(raw)
         self.simulations += len(self.unknowns) * len(self.episodes)
-        return levenberg_marquardt.Linearised(*self._ask("linearise", raw, work))
+        rows = self._recall("linearise", raw, lambda: self._rows([self._tangents(raw, i) for i in episodes]))
+        return levenberg_marquardt.Linearised(*rows)
 
-    def figures(self, raw: Tensor) -> Figures:
-        """Distances at a point."""
-        self._meet(raw)
-        chamfer, rms, per_frame = self._ask("figures", raw, lambda: self._figures(raw))
-        return Figures(float(chamfer), float(rms), per_frame)
+    def distance_metrics(self, raw: Tensor) -> DistanceMetrics:
+        """Compute the reported distances [m] at a point."""
+        self._count_simulations(raw)
 
-    def _figures(self, raw: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        now = figures(self.frames(raw), self.episodes, self.faces)
-        return torch.tensor(now.chamfer), torch.tensor(now.rms), now.per_frame
+        def compute() -> tuple[Tensor, Tensor, Tensor]:
+            metrics = distance_metrics(self.simulate_vertices(raw), self.episodes, self.faces)
+            return torch.tensor(metrics.chamfer), torch.tensor(metrics.rms), metrics.per_frame
 
-    def distance(self, raw: Tensor) -> float:
-        """Mean distance [m] from what was seen and is in use; of forces alone their root mean square [N]."""
+        chamfer, rms, per_frame = self._recall("figures", raw, compute)
+        return DistanceMetrics(float(chamfer), float(rms), per_frame)
+
+    def mean_distance(self, raw: Tensor) -> float:
+        """Compute the mean distance [m] from the data in use; of forces alone, their root mean square error [N]."""
         if self.uses("points") and self.uses("markers"):
-            return self.figures(raw).chamfer
-        self._meet(raw)
-        return float(self._ask("distance", raw, lambda: torch.tensor(self._distance(raw))))
+            return self.distance_metrics(raw).chamfer
+        self._count_simulations(raw)
+        return float(self._recall("distance", raw, lambda: torch.tensor(self._mean_distance(raw))))
 
-    def _distance(self, raw: Tensor) -> float:
+    def _mean_distance(self, raw: Tensor) -> float:
         if not self.uses("points", "markers"):
-            return forces_rms([frames.wrench for frames in self.seen(raw)], self.episodes)
+            return force_rms([frames.wrench for frames in self.observe(raw)], self.episodes)
         if self.uses("points"):
-            seen = [replace(e, markers=None) for e in self.episodes]
+            episodes = [replace(e, markers=None) for e in self.episodes]
         else:
-            seen = [replace(e, clouds=[cloud[:0] for cloud in e.clouds]) for e in self.episodes]
-        return figures(self.frames(raw), seen, self.faces).chamfer
+            episodes = [replace(e, clouds=[cloud[:0] for cloud in e.clouds]) for e in self.episodes]
+        return distance_metrics(self.simulate_vertices(raw), episodes, self.faces).chamfer
 
-    def cost(self, raw: Tensor, i: int, at: levenberg_marquardt.Iterate) -> Tensor:
-        """Robust cost of episode ``i`` by the scales of ``at``, without priors; differentiable in reverse mode."""
-        scene = scene_of(self.simulate(raw, i), None, self.episodes[i], self.sheet)
+    def robust_cost(self, raw: Tensor, i: int, at: levenberg_marquardt.Iterate) -> Tensor:
+        """Compute the robust cost of episode ``i`` with the scales of ``at``, without priors.
+
+        It is differentiable in reverse mode.
+        """
+        scene = match_points(self.simulate(raw, i), None, self.episodes[i], self.surface)
         total = raw.new_zeros(())
         for b, block in enumerate(self.blocks):
             rows = block.rows(scene)
             if rows is not None:
-                loss, _ = huber(rows.value.to(at.scale) / at.scale[b], at.gate[b])
-                total = total + at.share[b] * loss.sum()
+                loss, _ = huber(rows.residual.to(at.scale) / at.scale[b], at.outlier_cutoff[b])
+                total = total + at.effective_fraction[b] * loss.sum()
         return total
 
-    def value_and_slope(
+    def value_and_gradient(
         self, question: str, raw: Tensor, loss: Callable[[Objective, Tensor, int], Tensor]
     ) -> tuple[Tensor, Tensor]:
-        """A loss summed over the episodes, and its gradient [K] in reverse mode; one graph at a time."""
+        """Compute a loss summed over the episodes, and its gradient [K] in reverse mode, one graph at a time."""
 
-        def work() -> tuple[Tensor, Tensor]:
+        def compute() -> tuple[Tensor, Tensor]:
             leaf, total = raw.clone().requires_grad_(), torch.zeros((), dtype=raw.dtype)
             for i in range(len(self.episodes)):
                 part = loss(self, leaf, i)
@@ -282,84 +330,101 @@ class Objective:
             return total, torch.zeros_like(raw) if leaf.grad is None else leaf.grad
 
         self.simulations += len(self.episodes)
-        value, slope = self._ask(question, raw, work)
-        return value, slope
+        value, gradient = self._recall(question, raw, compute)
+        return value, gradient
 
-    def _ask(self, question: str, raw: Tensor, work: Callable[[], Any]) -> Any:
+    def _recall(self, question: str, raw: Tensor, compute: Callable[[], Any]) -> Any:
+        """Answer of the journal, if there is one that has it, else of ``compute``."""
         if self.journal is None:
-            return work()
-        return self.journal.ask(f"{question}-{digest([(e.observed, len(e.times)) for e in self.episodes])}", raw, work)
+            return compute()
+        frame_counts = digest([(e.observed_count, len(e.times)) for e in self.episodes])
+        return self.journal.get_or_compute(f"{question}-{frame_counts}", raw, compute)
 
-    def secants(self, raw: Tensor, steps: Tensor) -> tuple[levenberg_marquardt.Linearised, Reach]:
-        """The same with one-sided differences over finite ``steps`` of the fabric's unknowns, and how far these reach.
+    def linearise_by_differences(
+        self, raw: Tensor, steps: Tensor
+    ) -> tuple[levenberg_marquardt.Linearised, ParameterInfluence]:
+        """Linearise with one-sided differences over finite ``steps`` of the fabric's unknowns.
 
-        They are what survives where the motion is unstable.
+        Such slopes still mean something where the motion is unstable.
+
+        Returns:
+            The rows, and how far a unit of each of the fabric's unknowns moves the cloth.
         """
-        both = [self._tangents(raw, i) for i in range(len(self.episodes))]
+        simulated = [self._tangents(raw, i) for i in range(len(self.episodes))]
         for k in range(len(self.unknowns)):
-            step, seen = self._beside(raw, k, float(steps[k]))
-            for (frames, moved), ahead in zip(both, seen, strict=bool(step)):
-                moved.x[k] = (ahead.x - frames.x) / step
-                for name in moved.wrench:
-                    moved.wrench[name][k] = (ahead.wrench[name] - frames.wrench[name]) / step
+            step, shifted_frames = self._simulate_shifted(raw, k, float(steps[k]))
+            for (frames, derivatives), shifted in zip(simulated, shifted_frames, strict=bool(step)):
+                derivatives.x[k] = (shifted.x - frames.x) / step
+                for name in derivatives.wrench:
+                    derivatives.wrench[name][k] = (shifted.wrench[name] - frames.wrench[name]) / step
         count = len(self.unknowns)
-        position = torch.stack([m.x[:count].square().sum(-1).mean((1, 2)) for _, m in both])
-        wrenches = [w[:count, 1:, :3].square().sum(-1).mean(1) for _, m in both for w in m.wrench.values()]
-        force = torch.stack(wrenches).mean(0) if wrenches else torch.zeros(count)
-        return self._rows(both), Reach(position.mean(0).sqrt(), force.sqrt())
+        position = torch.stack([d.x[:count].square().sum(-1).mean((1, 2)) for _, d in simulated])
+        wrenches = [w for _, d in simulated for w in d.wrench.values()]
+        forces = [w[:count, 1:, :3].square().sum(-1).mean(1) for w in wrenches]
+        force = torch.stack(forces).mean(0) if forces else torch.zeros(count)
+        return self._rows(simulated), ParameterInfluence(position.mean(0).sqrt(), force.sqrt())
 
-    def _beside(self, raw: Tensor, k: int, step: float) -> tuple[float, list[Frames]]:
-        """(step along an unknown, what is seen there), back where nothing can be simulated ahead; (0, []): nowhere."""
+    def _simulate_shifted(self, raw: Tensor, k: int, step: float) -> tuple[float, list[Frames]]:
+        """(step along an unknown, frames there), backwards where forwards fails; (0, []) where both fail."""
         here, clip = float(raw[k]), self.unknowns[k].clip
-        for way in (clip(here + step) - here, clip(here - step) - here):
+        for signed_step in (clip(here + step) - here, clip(here - step) - here):
             shifted = raw.clone()
-            shifted[k] += way
+            shifted[k] += signed_step
             with suppress(SimulationDiverged, UnstableStep):
-                if way:
-                    return way, self.seen(shifted)
+                if signed_step:
+                    return signed_step, self.observe(shifted)
         return 0.0, []
 
-    def _rows(self, both: Sequence[tuple[Frames, Frames | None]]) -> levenberg_marquardt.Linearised:
-        parts: list[tuple[int, int, int, Rows]] = []
-        first = 0
-        for (frames, moved), episode in zip(both, self.episodes, strict=True):
-            scene = scene_of(frames, moved, episode, self.sheet)
+    def _rows(self, simulated: Sequence[tuple[Frames, Frames | None]]) -> levenberg_marquardt.Linearised:
+        parts: list[tuple[int, int, int, ResidualRows]] = []
+        first_frame = 0
+        for (frames, derivatives), episode in zip(simulated, self.episodes, strict=True):
+            scene = match_points(frames, derivatives, episode, self.surface)
             for b, block in enumerate(self.blocks):
                 rows = block.rows(scene)
                 if rows is not None:
-                    parts.append((b, first, _stride(episode.times), rows))
-            first += len(episode.times) + levenberg_marquardt.WINDOW  # windows do not reach across episodes
+                    parts.append((b, first_frame, self._frames_per_reference_period(episode.times), rows))
+            first_frame += len(episode.times) + self.noise_model.frames_per_time_block
         if not parts:
             asked = ", ".join(block.name for block in self.blocks)
             raise InvalidInput("use", got=f"{asked}, which no episode has", expected="kinds of data that one has")
-        double, count = torch.float64, len(self.start)
-        value = torch.cat([r.value for *_, r in parts]).to(double)
+        count = len(self.start)
+        residual = torch.cat([r.residual for *_, r in parts]).to(torch.float64)
         if any(r.jacobian is not None for *_, r in parts):
-            zeros = lambda r: r.value.new_zeros(len(r.value), count)  # noqa: E731
-            jacobian = torch.cat([zeros(r) if r.jacobian is None else r.jacobian for *_, r in parts]).to(double)
-        else:  # one zero for all: with many rows and unknowns they would fill memory and journal
-            jacobian = value.new_zeros(1, 1).expand(len(value), count)
+            jacobians = [
+                r.residual.new_zeros(len(r.residual), count) if r.jacobian is None else r.jacobian for *_, r in parts
+            ]
+            jacobian = torch.cat(jacobians).to(torch.float64)
+        else:  # a single zero, expanded: rows times unknowns of them would fill memory and journal
+            jacobian = residual.new_zeros(1, 1).expand(len(residual), count)
         return levenberg_marquardt.Linearised(
-            value=value,
+            residual=residual,
             jacobian=jacobian,
-            factor=torch.ones_like(value),
-            frame=torch.cat([r.frame + offset for _, offset, _, r in parts]),
-            patch=torch.cat([r.patch for *_, r in parts]),
-            block=torch.cat([torch.full((len(r.value),), b) for b, *_, r in parts]),
-            moment=torch.cat([r.frame // stride + offset for _, offset, stride, r in parts]),
+            prior_weight=torch.ones_like(residual),
+            frame=torch.cat([r.frame + first for _, first, _, r in parts]),
+            error_group=torch.cat([r.error_group for *_, r in parts]),
+            block=torch.cat([torch.full((len(r.residual),), b) for b, *_, r in parts]),
+            time_block=torch.cat([r.frame // stride + first for _, first, stride, r in parts]),
         )
 
+    def _frames_per_reference_period(self, times: Tensor) -> int:
+        if len(times) < 2:
+            return 1
+        return max(1, round(1 / (self.noise_model.reference_rate_hz * float(times.diff().median()))))
 
-def _stride(times: Tensor) -> int:
-    """Frames in 1 / PACE s."""
-    return 1 if len(times) < 2 else max(1, round(1 / (levenberg_marquardt.PACE * float(times.diff().median()))))
 
+def apply_nuisance(
+    nuisance_slice: NuisanceSlice, frames: Frames, derivatives: Frames, raw: Tensor, episode: Episode
+) -> tuple[Frames, Frames]:
+    """Observe frames and their derivatives (K in front) through a nuisance."""
+    values = raw[nuisance_slice.index].to(frames.x)
+    value_derivatives = values.new_zeros(len(raw), len(values))
+    value_derivatives[nuisance_slice.index] = torch.eye(len(values), dtype=values.dtype)
 
-def pushed(p: Placed, frames: Frames, moved: Frames, raw: Tensor, episode: Episode) -> tuple[Frames, Frames]:
-    """A nuisance's view of the frames, and the derivatives through it."""
-    values = raw[p.where].to(frames.x)
-    own = values.new_zeros(len(raw), len(values))
-    own[p.where] = torch.eye(len(values), dtype=values.dtype)
-    see = lambda f, v: p.nuisance.see(f, v, episode)  # noqa: E731
-    along = lambda df, dv: torch.func.jvp(see, (frames, values), (df, dv))[1]  # noqa: E731
-    return see(frames, values), torch.func.vmap(along)(moved, own)
+    def observe(frames: Frames, values: Tensor) -> Frames:
+        return nuisance_slice.nuisance.observe(frames, values, episode)
+
+    def along(d_frames: Frames, d_values: Tensor) -> Frames:
+        return torch.func.jvp(observe, (frames, values), (d_frames, d_values))[1]
+
+    return observe(frames, values), torch.func.vmap(along)(derivatives, value_derivatives)

@@ -1,93 +1,132 @@
 """How long a motion can be predicted: the frames over which derivatives hold.
 
-Light cloth that buckles forgets small differences: its tangents grow some tenfold in a third of a second, for ever,
-while the ripples that differ stay millimetres high. Before that the motion is as regular as any other, and the data
-tell as much as the tangents say. So where the whole does not pass the test of ``linearity``, the longest beginning is
-sought that does.
+Light cloth that buckles forgets small differences. Its tangents grow some tenfold in a third of a second, for ever,
+while the ripples that differ stay millimetres high. Before that, the motion is as regular as any other, and the data
+contain as much information as the tangents say. Where the whole motion fails the test of ``linearity``, this module
+seeks the longest beginning that passes it.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import NamedTuple
 
 from torch import Tensor
 
 from ...errors import SimulationDiverged, UnstableStep
 from . import levenberg_marquardt
-from .linearity import Checked, check, runaway
+from .linearity import LinearityCheck, check_linearity, has_runaway_tangents
 from .objective import Objective
 
-SHARES = (0.1, 0.15, 0.22, 0.33, 0.5, 0.75)  # of the frames, one after the other
-HALVINGS = 2
-ITERATIONS = 20
-NEAR, EXACT = 1.0, 0.1  # standard errors of a step that ends a search: while the beginning grows, and of the longest
+
+@dataclass(frozen=True)
+class PredictabilitySettings:
+    """How the longest predictable beginning is sought.
+
+    Attributes:
+        fractions: fractions of the frames, tried one after the other.
+        max_bisections: bisections between the last fraction that passes and the first that fails.
+        max_iterations: steps of each search.
+        growing_tolerance: standard errors of a step that ends a search while the beginning grows.
+        final_tolerance: standard errors of a step that ends the search on the longest beginning.
+    """
+
+    fractions: tuple[float, ...] = (0.1, 0.15, 0.22, 0.33, 0.5, 0.75)
+    max_bisections: int = 2
+    max_iterations: int = 20
+    growing_tolerance: float = 1.0
+    final_tolerance: float = 0.1
 
 
-class Within(NamedTuple):
-    """A solution on the beginning of the episodes."""
+PREDICTABILITY_SETTINGS = PredictabilitySettings()
 
-    objective: Objective  # of those frames
-    checked: Checked
-    until: float  # s, of the motion
+
+class PredictableFit(NamedTuple):
+    """A solution on the beginning of the episodes.
+
+    Attributes:
+        objective: of those frames.
+        checked: the solution, whose derivatives hold.
+        duration: length of the beginning [s].
+    """
+
+    objective: Objective
+    checked: LinearityCheck
+    duration: float
 
 
 OnIterate = Callable[[levenberg_marquardt.Iterate, Objective], bool]
 
 
-def within(objective: Objective, failed: Checked, start: Tensor, on_iterate: OnIterate) -> Within | None:
-    """The solution on the longest beginning that can be predicted; None where there is none.
+def fit_predictable_part(
+    objective: Objective,
+    failed: LinearityCheck,
+    start: Tensor,
+    on_iterate: OnIterate,
+    settings: PredictabilitySettings = PREDICTABILITY_SETTINGS,
+) -> PredictableFit | None:
+    """Fit the longest beginning of the motion that can be predicted.
 
-    The beginning grows, and each solution is where the next search starts: from a wrong start the later ripples are
+    The beginning grows, and each search starts from the solution before. From a wrong start the later ripples are
     wrong as well, and lead nowhere.
 
     Args:
         objective: of all frames.
-        failed: what became of them.
+        failed: the check that all frames failed.
         start: [K].
         on_iterate: called with (iterate, objective) at every point; returns True to stop.
+        settings: which beginnings are tried.
+
+    Returns:
+        The solution, or None where no beginning can be predicted.
     """
+    near, exact = settings.growing_tolerance, settings.final_tolerance
     best, high = None, 1.0
-    for share in SHARES:
-        found = _solved(objective, share, start if best is None else best[1].final.raw, on_iterate, NEAR)
-        if found is not None:
-            best, low = found, share
+    for fraction in settings.fractions:
+        begin = start if best is None else best[1].final.raw
+        result = _solve_part(objective, fraction, begin, on_iterate, near, settings)
+        if result is not None:
+            best, low = result, fraction
         elif best is not None:
-            high = share
+            high = fraction
             break
     if best is None:
         return None
-    for _ in range(HALVINGS):
-        share = 0.5 * (low + high)
-        found = _solved(objective, share, best[1].final.raw, on_iterate, NEAR)
-        low, high, best = (low, share, best) if found is None else (share, high, found)
-    near = best[0], best[1]._replace(final=best[1].final._replace(converged=False))
-    return _told(objective, failed, *(_solved(objective, low, best[1].final.raw, on_iterate, EXACT) or near))
+    for _ in range(settings.max_bisections):
+        fraction = 0.5 * (low + high)
+        result = _solve_part(objective, fraction, best[1].final.raw, on_iterate, near, settings)
+        low, high, best = (low, fraction, best) if result is None else (fraction, high, result)
+    part, checked = best
+    exact_result = _solve_part(objective, low, checked.final.raw, on_iterate, exact, settings)
+    part, checked = exact_result or (part, checked._replace(final=checked.final._replace(converged=False)))
+    frames, count = (max(e.observed_count for e in o.episodes) for o in (part, objective))
+    duration = max(float(e.times[e.observed_count - 1] - e.times[0]) for e in part.episodes)
+    warning = (
+        f"{failed.failure_reason}: derivatives hold for the first {duration:.2f} s only, and only those frames, "
+        f"{frames} of {count}, were used"
+    )
+    return PredictableFit(part, checked._replace(warnings=[warning]), duration)
 
 
-def _solved(
-    objective: Objective, share: float, start: Tensor, on_iterate: OnIterate, tolerance: float
-) -> tuple[Objective, Checked] | None:
-    """On a share of the frames; None where derivatives do not hold."""
-    part = objective.part(share)
-    if not part.told:
+def _solve_part(
+    objective: Objective,
+    fraction: float,
+    start: Tensor,
+    on_iterate: OnIterate,
+    tolerance: float,
+    settings: PredictabilitySettings,
+) -> tuple[Objective, LinearityCheck] | None:
+    """Solution on a fraction of the frames; None where derivatives do not hold."""
+    part = objective.first_fraction(fraction)
+    if not part.has_data:
         return None
     try:
         final = levenberg_marquardt.minimise(
-            part.problem(), start, ITERATIONS, lambda it: on_iterate(it, part), tolerance
+            part.problem(), start, settings.max_iterations, lambda it: on_iterate(it, part), tolerance
         )
-        checked = None if runaway(part, final) else check(part, final)
+        checked = None if has_runaway_tangents(part, final) else check_linearity(part, final)
     except (SimulationDiverged, UnstableStep):
         checked = None
     objective.simulations += part.simulations
-    return None if checked is None or checked.withdrawn else (part, checked)
-
-
-def _told(objective: Objective, failed: Checked, part: Objective, checked: Checked) -> Within:
-    frames, count = (max(e.observed for e in o.episodes) for o in (part, objective))
-    until = max(float(e.times[e.observed - 1] - e.times[0]) for e in part.episodes)
-    warning = (
-        f"{failed.reason}: derivatives hold for the first {until:.2f} s only, and only those frames, "
-        f"{frames} of {count}, were used"
-    )
-    return Within(part, checked._replace(warnings=[warning]), until)
+    return None if checked is None or checked.is_withdrawn else (part, checked)

@@ -1,4 +1,4 @@
-"""One search for the unknowns, by any estimator: its history, when it stops, and from where it begins."""
+"""One search for the unknowns by any estimator: its history, when it stops, and where it begins."""
 
 from __future__ import annotations
 
@@ -8,149 +8,201 @@ from typing import Any, Literal, NamedTuple
 from torch import Tensor
 
 from ...errors import SimulationDiverged, UnstableStep
-from ..uncertainty.reporting import undecided
+from ..uncertainty.consider_covariance import solution_covariance
+from ..uncertainty.estimates import make_estimates
 from . import levenberg_marquardt, linearity, multistart, predictability, statistical_linearisation
-from .convergence import astray
-from .gradient_descent import descend, quasi_newton, to_vertices
+from .convergence import find_failure_reason
+from .gradient_descent import chamfer_to_nearest_vertex, minimise_by_gradient_descent, minimise_by_lbfgs
 from .objective import Objective
 
 Method = Literal["gauss-newton", "lbfgs", "adam", "gradient-descent"]
 METHODS: tuple[str, ...] = ("gauss-newton", "lbfgs", "adam", "gradient-descent")
-CHAMFER = METHODS[2:]  # those that follow the paper's distance alone
-PAPER_CHAMFER = 0.015  # m, the DiffCP paper's stop rule
-EARLY = 0.35  # share of the frames that the first stage of the fit sees
-EARLY_ITERATIONS = 10
-RIPPLES = "simulations around the solution know what is near, not what is best"
-GO_ON = "more iterations of Gauss-Newton, a nearer start or several, or fewer parameters at once may get there"
+CHAMFER_METHODS = METHODS[2:]  # these minimise the paper's distance alone
+PAPER_STOP_CHAMFER_M = 0.015  # stop rule of the DiffCP paper
+EARLY_FRAME_FRACTION = 0.35  # of the frames, in the first stage of the fit
+MAX_EARLY_ITERATIONS = 10
+EARLY_TOLERANCE_STD_ERRORS = 1.0  # of a step that ends the first stage
+SAMPLED_FIT_NOTE = "simulations around the solution know what is near, not what is best"
+UNFINISHED_REMEDY = (
+    "more iterations of Gauss-Newton, a nearer start or several, or fewer parameters at once may get there"
+)
 
-Progress = Callable[[int, float, dict[str, float], float], None]  # iteration, Chamfer, values, share of the frames
+Progress = Callable[[int, float, dict[str, float], float], None]  # iteration, Chamfer [m], values, fraction of frames
 
 
 class Outcome(NamedTuple):
-    """Where a search ended."""
+    """Where a search ended.
 
-    objective: Objective  # of the frames that told it
-    checked: linearity.Checked
-    unfinished: str  # why the end may not be the optimum; empty where it is
-    reached: multistart.Reached | None  # with several starts
+    Attributes:
+        objective_used: of the frames that the solution is from.
+        checked: the solution.
+        unfinished_reason: why the end may not be the optimum. Empty where it is.
+        multistart: what several starts led to; None with a single start.
+    """
+
+    objective_used: Objective
+    checked: linearity.LinearityCheck
+    unfinished_reason: str
+    multistart: multistart.MultistartResult | None
 
 
 class Search:
-    """Keeps the history and knows when to stop; ``strata`` [E]: ``replicates.strata_of``."""
+    """Runs an estimator, keeps its history and decides when it stops.
+
+    Args:
+        objective: of all frames.
+        stop: "converged" or "paper".
+        on_progress: called after every iteration.
+        strata: [E] groups of replicates (``replicates.assign_strata``).
+
+    Attributes:
+        history: one entry per iteration.
+        partial_simulations: number of simulations of parts of the episodes.
+        reached_paper_threshold: whether the paper's rule stopped the search.
+    """
 
     def __init__(
         self, objective: Objective, stop: str, on_progress: Progress | None, strata: Tensor | None = None
     ) -> None:
         self.objective, self.stop, self.on_progress, self.strata = objective, stop, on_progress, strata
         self.history: list[dict[str, Any]] = []
-        self.elsewhere = 0  # simulations of parts of the episodes
-        self.near = False  # stopped by the paper's rule
+        self.partial_simulations = 0
+        self.reached_paper_threshold = False
 
     @property
     def simulations(self) -> int:
-        """Of all stages."""
-        return self.elsewhere + self.objective.simulations
+        """Number of simulations of all stages."""
+        return self.partial_simulations + self.objective.simulations
 
     def run(self, method: str, start: Tensor, iterations: int, rate: float, early: bool, count: int) -> Outcome:
-        """From ``start`` [K], or from ``count`` starts around it, to the end."""
-        full, reached = self.objective, None
+        """Search from ``start`` [K], or from ``count`` starts around it, to the end.
+
+        Args:
+            method: one of ``METHODS``.
+            start: [K].
+            iterations: largest number of steps on all frames.
+            rate: of gradient descent.
+            early: fit the early frames first.
+            count: number of starts.
+        """
+        full, starts = self.objective, None
         if count > 1:
-            reached = self._from_several(start, count, iterations)
-            start = reached.raw
+            starts = self._search_from_several(start, count, iterations)
+            start = starts.raw
         elif early and method == "gauss-newton":
-            part = full.part(EARLY)
-            start = self._early(part, start, iterations).raw if part.told else start
-            self.elsewhere += part.simulations
-        final = self._to_the_end(method, start, iterations, rate)
-        checked = linearity.check(full, final)
-        if checked.withdrawn and method not in CHAMFER and self.stop != "paper":
-            told, checked = self._resolve(checked, start, iterations)
+            part = full.first_fraction(EARLY_FRAME_FRACTION)
+            start = self._fit_early_frames(part, start, iterations).raw if part.has_data else start
+            self.partial_simulations += part.simulations
+        final = self._fit_all_frames(method, start, iterations, rate)
+        checked = linearity.check_linearity(full, final)
+        if checked.is_withdrawn and method not in CHAMFER_METHODS and self.stop != "paper":
+            used, checked = self._resolve_unstable(checked, start, iterations)
         else:
-            told = full
-        why = self._undecided() if method in CHAMFER else self._why()
-        why = "" if checked.final.converged else why
-        sure = not why and checked.covariance is None
-        lost = "" if sure or checked.withdrawn else astray(told, checked)
-        if lost:
-            why = f"{why or RIPPLES}; {lost}, and no parameter counts as identified: {GO_ON}"
-            checked = checked._replace(reason=lost)
-        return Outcome(told, checked, why, reached)
+            used = full
+        reason = "" if checked.final.converged else self._unfinished_reason(method)
+        is_regular = not reason and checked.covariance is None
+        failure = "" if is_regular or checked.is_withdrawn else find_failure_reason(used, checked)
+        if failure:
+            reason = (
+                f"{reason or SAMPLED_FIT_NOTE}; {failure}, and no parameter counts as identified: {UNFINISHED_REMEDY}"
+            )
+            checked = checked._replace(failure_reason=failure)
+        return Outcome(used, checked, reason, starts)
 
-    def _resolve(
-        self, failed: linearity.Checked, start: Tensor, iterations: int
-    ) -> tuple[Objective, linearity.Checked]:
-        """Where tangents fail: what the beginning tells, and of the rest what is told by simulations spread around."""
+    def _resolve_unstable(
+        self, failed: linearity.LinearityCheck, start: Tensor, iterations: int
+    ) -> tuple[Objective, linearity.LinearityCheck]:
+        """Where tangents fail: fit the predictable beginning, then the rest by simulations spread around it."""
         full = self.objective
-        found = predictability.within(full, failed, start, self._judge)
-        if found is not None and not undecided(found.objective, found.checked, self.strata):
-            return found.objective, found.checked
-        record = lambda raw: self.record(raw, full)  # noqa: E731
-        wide = statistical_linearisation.resolved(full, failed, found, iterations, record, self.strata)
-        if wide is None:
-            return (full, failed) if found is None else (found.objective, found.checked)
-        return full, wide
+        beginning = predictability.fit_predictable_part(full, failed, start, self._append_iterate)
+        if beginning is not None and not self._undecided_parameters(beginning.objective, beginning.checked):
+            return beginning.objective, beginning.checked
 
-    def _to_the_end(self, method: str, start: Tensor, iterations: int, rate: float) -> levenberg_marquardt.Iterate:
+        def on_round(raw: Tensor) -> bool:
+            return self.append_history(raw, full)
+
+        sampled = statistical_linearisation.fit_by_sampling(full, failed, beginning, iterations, on_round, self.strata)
+        if sampled is None:
+            return (full, failed) if beginning is None else (beginning.objective, beginning.checked)
+        return full, sampled
+
+    def _undecided_parameters(self, objective: Objective, checked: linearity.LinearityCheck) -> list[str]:
+        """Names of fitted parameters that a solution does not identify."""
+        covariance = solution_covariance(objective, checked, self.strata)
+        estimates = make_estimates(objective.cloth, objective.unknowns, checked.final.raw, covariance).parameters
+        return [u.name for u in objective.unknowns if not (u.measured or estimates[u.name].identifiable)]
+
+    def _fit_all_frames(self, method: str, start: Tensor, iterations: int, rate: float) -> levenberg_marquardt.Iterate:
         full = self.objective
         if method == "gauss-newton":
-            return levenberg_marquardt.minimise(full.problem(), start, iterations, lambda it: self._judge(it, full))
+            return levenberg_marquardt.minimise(
+                full.problem(), start, iterations, lambda it: self._append_iterate(it, full)
+            )
         if method == "lbfgs":
-            raw, done = quasi_newton(full, start, iterations, self.record)
+            raw, converged = minimise_by_lbfgs(full, start, iterations, self.append_history)
         else:
-            raw, done = descend(full, start, iterations, rate, self.record, adam=method == "adam"), False
-        return levenberg_marquardt.minimise(full.problem(), raw, 0, lambda _: True)._replace(converged=done)
+            adam, converged = method == "adam", False
+            raw = minimise_by_gradient_descent(full, start, iterations, rate, self.append_history, adam)
+        return levenberg_marquardt.minimise(full.problem(), raw, 0, lambda _: True)._replace(converged=converged)
 
-    def _judge(self, at: levenberg_marquardt.Iterate, objective: Objective) -> bool:
-        """One more iteration; whether to stop, which tangents that run away are a reason for as well."""
-        return self.record(at.raw, objective) or (at.exact and linearity.runaway(objective, at))
+    def _append_iterate(self, at: levenberg_marquardt.Iterate, objective: Objective) -> bool:
+        """Record an iteration and tell whether to stop; tangents that run away are a reason as well."""
+        should_stop = self.append_history(at.raw, objective)
+        return should_stop or (at.exact and linearity.has_runaway_tangents(objective, at))
 
-    def record(self, raw: Tensor, objective: Objective) -> bool:
-        """One more iteration; whether the search may stop here."""
-        now, values = objective.figures(raw), objective.values(raw)
-        share = sum(e.observed for e in objective.episodes) / sum(e.observed for e in self.objective.episodes)
-        entry = {"iteration": len(self.history), "frames": share, "chamfer": now.chamfer, "rms": now.rms}
+    def append_history(self, raw: Tensor, objective: Objective) -> bool:
+        """Record an iteration, and tell whether the search may stop here."""
+        metrics, values = objective.distance_metrics(raw), objective.physical_values(raw)
+        used, total = (sum(e.observed_count for e in o.episodes) for o in (objective, self.objective))
+        fraction = used / total
+        entry = {
+            "iteration": len(self.history),
+            "frame_fraction": fraction,
+            "chamfer": metrics.chamfer,
+            "rms": metrics.rms,
+        }
         self.history.append({**entry, **values})
         if self.on_progress is not None:
-            self.on_progress(len(self.history) - 1, now.chamfer, values, share)
+            self.on_progress(len(self.history) - 1, metrics.chamfer, values, fraction)
         if self.stop == "paper" and objective is self.objective:
-            pairs = zip(objective.frames(raw), objective.episodes, strict=True)
-            losses = [float(to_vertices(frames, episode)) for frames, episode in pairs]
-            self.near = sum(losses) / len(losses) < PAPER_CHAMFER
-        return self.near
+            pairs = zip(objective.simulate_vertices(raw), objective.episodes, strict=True)
+            losses = [float(chamfer_to_nearest_vertex(frames, episode)) for frames, episode in pairs]
+            self.reached_paper_threshold = sum(losses) / len(losses) < PAPER_STOP_CHAMFER_M
+        return self.reached_paper_threshold
 
-    def tell(self, at: levenberg_marquardt.Iterate) -> bool:
-        """Of what is done after the search: progress, and no part of the history."""
+    def report_progress(self, at: levenberg_marquardt.Iterate) -> bool:
+        """Report progress of work after the search, which is no part of the history; never ask to stop."""
         if self.on_progress is not None:
-            now = self.objective.figures(at.raw).chamfer
-            self.on_progress(len(self.history) - 1, now, self.objective.values(at.raw), 1.0)
+            chamfer = self.objective.distance_metrics(at.raw).chamfer
+            self.on_progress(len(self.history) - 1, chamfer, self.objective.physical_values(at.raw), 1.0)
         return False
 
-    def _early(self, part: Objective, start: Tensor, iterations: int) -> levenberg_marquardt.Iterate:
-        """On early frames, where a wrong start has not yet led the cloth elsewhere."""
-        budget = min(EARLY_ITERATIONS, iterations)
+    def _fit_early_frames(self, part: Objective, start: Tensor, iterations: int) -> levenberg_marquardt.Iterate:
+        """Fit early frames, in which a wrong start has not yet led the cloth elsewhere."""
         return levenberg_marquardt.minimise(
-            part.problem(), start, budget, lambda it: self._judge(it, part), tolerance=1.0
+            part.problem(),
+            start,
+            min(MAX_EARLY_ITERATIONS, iterations),
+            lambda it: self._append_iterate(it, part),
+            tolerance=EARLY_TOLERANCE_STD_ERRORS,
         )
 
-    def _from_several(self, start: Tensor, count: int, iterations: int) -> multistart.Reached:
-        part, found = self.objective.part(EARLY), []
-        part = part if part.told else self.objective
-        for raw in multistart.spread(self.objective.unknowns, start, count):
+    def _search_from_several(self, start: Tensor, count: int, iterations: int) -> multistart.MultistartResult:
+        part, ends = self.objective.first_fraction(EARLY_FRAME_FRACTION), []
+        part = part if part.has_data else self.objective
+        for raw in multistart.sample_starts(self.objective.unknowns, start, count):
             try:
-                found.append(self._early(part, raw, iterations))
+                ends.append(self._fit_early_frames(part, raw, iterations))
             except (SimulationDiverged, UnstableStep):
                 if raw is start:
                     raise
-        self.elsewhere += part.simulations if part is not self.objective else 0
-        return multistart.best(part.problem(), found)
+        self.partial_simulations += part.simulations if part is not self.objective else 0
+        return multistart.select_best(part.problem(), ends)
 
-    def _why(self) -> str:
-        if self.near:
+    def _unfinished_reason(self, method: str) -> str:
+        if self.reached_paper_threshold:
             return "stopped by the paper's rule, Chamfer below 1.5 cm: the values still depend on the start"
+        if method in CHAMFER_METHODS:
+            return "gradient descent has no test of convergence: values and errors may be those of an unfinished search"
         done = len(self.history) - 1
         return f"stopped after {done} iterations before converging: the search is unfinished, so are its errors"
-
-    def _undecided(self) -> str:
-        if self.near:
-            return self._why()
-        return "gradient descent has no test of convergence: values and errors may be those of an unfinished search"

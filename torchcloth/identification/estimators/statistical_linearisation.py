@@ -1,17 +1,18 @@
-"""Slopes where the motion is chaotic: by regression over simulations around a point, not by tangents.
+"""Slopes of a chaotic motion: by regression over simulations around a point, not by tangents.
 
-Light cloth that buckles forgets small differences: a change by a thousandth of its stiffness, and half a second later
-its ripples lie elsewhere. Tangents describe that exactly and grow without bound (some 10 to 100 times in 0.3 s), while
-the ripples themselves stay millimetres high. What a parameter does to the cloth as a whole is seen over finite steps,
-beyond the ripples. So simulations are spread around the point, as wide as the answer is uncertain; the straight line
-through their residuals is the slope (statistical linearisation, as in iterative ensemble smoothers: Chen and Oliver
-2013), and their scatter about it is what ripples contribute, which the measured cloth has as well: noise by which rows
-are weighted, and by which the errors are widened.
+Light cloth that buckles forgets small differences. After a change by a thousandth of its stiffness its ripples lie
+elsewhere half a second later. Tangents describe that exactly and grow without bound (some 10 to 100 times in 0.3 s),
+while the ripples themselves stay millimetres high. What a parameter does to the cloth as a whole shows over finite
+steps, beyond the ripples. So simulations are spread around the point, as wide as the answer is uncertain. The straight
+line through their residuals is the slope (statistical linearisation, as in iterative ensemble smoothers: Chen and
+Oliver 2013). Their scatter about it is the contribution of the ripples, which the measured cloth has as well: rows are
+weighted by this noise, and the errors are widened by it.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import torch
@@ -19,172 +20,225 @@ from torch import Tensor
 
 from ...errors import SimulationDiverged, UnstableStep
 from ..residuals.metrics import noise_scale
-from ..uncertainty.consider_covariance import covariance_of, with_held_places
-from ..uncertainty.identifiability import Reach
+from ..uncertainty.consider_covariance import solution_covariance, with_grasp_offsets
+from ..uncertainty.identifiability import ParameterInfluence
 from . import levenberg_marquardt
 from .levenberg_marquardt import Iterate, Linearised
-from .linearity import Checked
+from .linearity import LinearityCheck
 from .objective import Objective
-from .predictability import Within
+from .predictability import PredictableFit
 
-ROUNDS = 8
-WIDE, NARROW = 0.4, 0.2  # of a longest step: standard deviations of the simulations around a point
-REACHED = 1.5  # of those a round may move at most
-NEAR = 2.5  # of those within which simulations of earlier rounds count
-SETTLED = 0.5  # standard errors of a step that ends the search
-WORSE, HALVINGS = 1.25, 4  # a step that makes the distance larger by more is halved, at most so often
-SEEN = 1.5  # mean square of a slope over that of its errors, from which it is one
-SHARP = 1e-6  # least variance of a combination that the beginning told, in units of each unknown's own
-SPARE = 4  # pairs of simulations beyond those that the slopes need
+
+@dataclass(frozen=True)
+class SamplingSettings:
+    """How simulations are spread around a point and what counts as a slope.
+
+    Attributes:
+        max_rounds: rounds of the search.
+        wide_std: widest standard deviation of the simulations around a point, in longest steps.
+        narrow_std: narrowest standard deviation, in longest steps.
+        max_move_stds: longest move of a round, in these standard deviations.
+        max_reuse_stds: distance within which simulations of earlier rounds count, in these standard deviations.
+        converged_std_errors: standard errors of a step that ends the search.
+        max_distance_ratio: a step that increases the distance by more than this factor is halved.
+        max_halvings: largest number of such halvings.
+        min_slope_to_error: mean square of a slope over that of its errors, from which it counts as one.
+        min_relative_variance: least variance of a combination that the beginning determined, in units of each
+            unknown's own.
+        spare_pairs: pairs of simulations beyond those that the slopes need.
+    """
+
+    max_rounds: int = 8
+    wide_std: float = 0.4
+    narrow_std: float = 0.2
+    max_move_stds: float = 1.5
+    max_reuse_stds: float = 2.5
+    converged_std_errors: float = 0.5
+    max_distance_ratio: float = 1.25
+    max_halvings: int = 4
+    min_slope_to_error: float = 1.5
+    min_relative_variance: float = 1e-6
+    spare_pairs: int = 4
+
+
+SAMPLING_SETTINGS = SamplingSettings()
 
 
 class Sample(NamedTuple):
-    """One simulation."""
+    """One simulation.
 
-    raw: Tensor  # [K]
-    value: Tensor  # [R], residuals
-    x: Tensor  # [F, V, 3] m, frames of all episodes
-    force: Tensor  # [F, 3] N, of all grippers
+    Attributes:
+        raw: [K] unknowns.
+        residual: [R].
+        x: [F, V, 3] m, frames of all episodes.
+        force: [F, 3] N, of all grippers.
+    """
+
+    raw: Tensor
+    residual: Tensor
+    x: Tensor
+    force: Tensor
 
 
-class Line(NamedTuple):
-    """What runs straight through a cloud, and the scatter about it, in rows of equal noise."""
+class LinearRegression(NamedTuple):
+    """The straight line through a cloud of simulations, and their scatter about it, in rows of equal noise.
+
+    Attributes:
+        linear: residuals and slopes at the centre.
+        scatter: [N, R] of each simulation about the line.
+        degrees_of_freedom: simulations less fitted numbers.
+    """
 
     linear: Linearised
-    scatter: Tensor  # [N, R], of each simulation
-    freedom: int
+    scatter: Tensor
+    degrees_of_freedom: int
 
 
-class Settled(NamedTuple):
-    """Where the search ended."""
+class SampledFit(NamedTuple):
+    """Where the search ended.
+
+    Attributes:
+        final: the solution.
+        influence: how far each unknown moves the cloth.
+        covariance: [K, K].
+        simulations: number of simulated episodes.
+    """
 
     final: Iterate
-    reach: Reach
-    covariance: Tensor  # [K, K]
+    influence: ParameterInfluence
+    covariance: Tensor
     simulations: int
 
 
-def resolved(
+def fit_by_sampling(
     objective: Objective,
-    failed: Checked,
-    known: Within | None,
+    failed: LinearityCheck,
+    beginning: PredictableFit | None,
     rounds: int,
     on_round: Callable[[Tensor], object],
     strata: Tensor | None = None,
-) -> Checked | None:
-    """All frames by simulations spread around the solution; None where they cannot be had.
+) -> LinearityCheck | None:
+    """Fit all frames by simulations spread around the solution.
 
     Args:
         objective: of all frames.
-        failed: what tangents made of them.
-        known: what the beginning told; it becomes the prior of what the other frames tell.
-        rounds: at most so many.
-        on_round: called with every point the search comes to.
-        strata: as of ``covariance_of``.
+        failed: the solution by tangents, which failed the check.
+        beginning: fit of the predictable beginning; it becomes the prior for the other frames.
+        rounds: largest number of rounds.
+        on_round: called with every point that the search comes to.
+        strata: [E] groups of replicates, as in ``solution_covariance``.
+
+    Returns:
+        The solution, or None where too many simulations fail.
     """
     before, problem = objective.simulations, objective.problem()
     raw, mask, note = failed.final.raw, None, ""
-    if known is not None:
-        told, mask = known.checked.final.raw, later(objective, known.objective)
-        problem = _after(problem, told, covariance_of(known.objective, known.checked, strata))
-        raw = _nearer(objective, told, raw)
-        note = f" after the first {known.until:.2f} s"
+    if beginning is not None:
+        start, mask = beginning.checked.final.raw, rows_after_part(objective, beginning.objective)
+        covariance = solution_covariance(beginning.objective, beginning.checked, strata)
+        problem = _with_prior(problem, start, covariance)
+        raw = _nearer_start(objective, start, raw)
+        note = f" after the first {beginning.duration:.2f} s"
     try:
-        found = _settle(Around(objective, mask), problem, raw, rounds, on_round)
+        result = _search(SampleCloud(objective, mask), problem, raw, rounds, on_round)
     except SimulationDiverged:
         return None
-    objective.simulations = before + found.simulations
+    objective.simulations = before + result.simulations
     warning = (
-        f"{failed.reason}: slopes and errors{note} were taken from {found.simulations} simulations around the "
+        f"{failed.failure_reason}: slopes and errors{note} were taken from {result.simulations} simulations around the "
         "solution, and what moves the cloth less than its ripples do is not identifiable"
     )
-    return Checked(found.final, found.reach, [warning], [], covariance=found.covariance)
+    return LinearityCheck(result.final, result.influence, [warning], [], covariance=result.covariance)
 
 
-def _after(problem: levenberg_marquardt.Problem, told: Tensor, covariance: Tensor) -> levenberg_marquardt.Problem:
-    """With what is known already as the prior: of two unknowns that only their sum is known of, as that."""
-    own = covariance.diagonal().sqrt()
-    std = torch.minimum(own, problem.prior_std)
-    values, vectors = torch.linalg.eigh(covariance / own[:, None] / own)
-    inverse = (vectors / values.clamp(min=SHARP)) @ vectors.mT
-    return problem._replace(prior_mean=told, prior_std=std, correlated=inverse / std[:, None] / std)
+def _with_prior(problem: levenberg_marquardt.Problem, mean: Tensor, covariance: Tensor) -> levenberg_marquardt.Problem:
+    """The problem with an earlier estimate as its prior, correlations included."""
+    deviation = covariance.diagonal().sqrt()
+    std = torch.minimum(deviation, problem.prior_std)
+    values, vectors = torch.linalg.eigh(covariance / deviation[:, None] / deviation)
+    inverse = (vectors / values.clamp(min=SAMPLING_SETTINGS.min_relative_variance)) @ vectors.mT
+    return problem._replace(prior_mean=mean, prior_std=std, prior_precision=inverse / std[:, None] / std)
 
 
-def _nearer(objective: Objective, told: Tensor, raw: Tensor) -> Tensor:
-    """Where the beginning ended, unless the end of tangents lies nearer to all frames: they may have gone far alone."""
+def _nearer_start(objective: Objective, beginning: Tensor, by_tangents: Tensor) -> Tensor:
+    """The end on the beginning, unless the end by tangents, which may have gone far, is nearer to all frames."""
     try:
-        return raw if objective.distance(raw) < objective.distance(told) else told
+        is_nearer = objective.mean_distance(by_tangents) < objective.mean_distance(beginning)
+        return by_tangents if is_nearer else beginning
     except (SimulationDiverged, UnstableStep):
-        return raw
+        return by_tangents
 
 
-def later(objective: Objective, part: Objective) -> Callable[[Linearised], Tensor]:
-    """Which rows of the whole belong to no frame of its beginning."""
+def rows_after_part(objective: Objective, part: Objective) -> Callable[[Linearised], Tensor]:
+    """Return a function that tells which rows [R] of the whole belong to no frame of its beginning ``part``."""
 
     def mask(linear: Linearised) -> Tensor:
-        episode = objective.episode_of(linear)
-        length = torch.tensor([len(e.times) + levenberg_marquardt.WINDOW for e in objective.episodes])
-        seen = torch.tensor([e.observed for e in part.episodes])
-        return linear.frame - (length.cumsum(0) - length)[episode] >= seen[episode]
+        episode = objective.episode_of_rows(linear)
+        gap = levenberg_marquardt.DEFAULT_NOISE_MODEL.frames_per_time_block
+        length = torch.tensor([len(e.times) + gap for e in objective.episodes])
+        used = torch.tensor([e.observed_count for e in part.episodes])
+        return linear.frame - (length.cumsum(0) - length)[episode] >= used[episode]
 
     return mask
 
 
-def _settle(
-    around: Around,
+def _search(
+    cloud: SampleCloud,
     problem: levenberg_marquardt.Problem,
     start: Tensor,
     rounds: int,
     on_round: Callable[[Tensor], object],
-) -> Settled:
+) -> SampledFit:
     """Gauss-Newton on slopes by regression, from ``start`` [K].
 
     Raises:
-        SimulationDiverged: too few simulations around a point go well.
+        SimulationDiverged: too few simulations around a point succeed.
     """
-    objective, raw = around.objective, problem.clip(start)
-    widest = WIDE * problem.longest
-    spread = torch.minimum(torch.maximum(problem.prior_std, NARROW * problem.longest), widest)
-    left = min(ROUNDS, max(1, rounds))
+    objective, raw, s = cloud.objective, problem.clip(start), SAMPLING_SETTINGS
+    widest, narrowest = s.wide_std * problem.max_step, s.narrow_std * problem.max_step
+    spread = torch.minimum(torch.maximum(problem.prior_std, narrowest), widest)
+    rounds_left = min(s.max_rounds, max(1, rounds))
     while True:
-        around.add(raw, spread)
-        near, left = around.near(raw, spread), left - 1
-        found = line(near, raw, around.rows)
-        at = _seen_only(problem, levenberg_marquardt.judged(problem, raw, found.linear))
+        cloud.add(raw, spread)
+        samples, rounds_left = cloud.near(raw, spread), rounds_left - 1
+        regression = regress(samples, raw, cloud.rows)
+        at = levenberg_marquardt.evaluate_point(problem, raw, regression.linear)
+        at = _drop_insignificant_slopes(problem, at)
         gradient, hessian = levenberg_marquardt.normal_equations(problem, at)
-        step = torch.linalg.solve(hessian, -gradient).clamp(-REACHED * spread, REACHED * spread)
-        moved = _downhill(objective, problem, raw, step)
-        ripples = _by_ripples(problem, at, found)
-        covariance = levenberg_marquardt.at_least(levenberg_marquardt.covariance(problem, at), ripples.diagonal())
+        limit = s.max_move_stds * spread
+        step = torch.linalg.solve(hessian, -gradient).clamp(-limit, limit)
+        moved = _limit_distance(objective, problem, raw, step)
+        variances = _ripple_covariance(problem, at, regression).diagonal()
+        covariance = levenberg_marquardt.inflate_covariance(levenberg_marquardt.covariance(problem, at), variances)
         deviation, fabric = covariance.diagonal().sqrt(), len(objective.unknowns)
-        small = bool(((moved - raw).abs() <= SETTLED * deviation)[:fabric].all())
+        converged = bool(((moved - raw).abs() <= s.converged_std_errors * deviation)[:fabric].all())
         on_round(moved)
-        if small or not left:
-            linear = at.linear._replace(value=at.linear.value + at.linear.jacobian @ (moved - raw))
-            final = levenberg_marquardt.judged(problem, moved, linear)._replace(converged=small)
-            made = len(around.samples) * len(objective.episodes)
-            return Settled(final, _reach(objective, near, raw), covariance, made)
-        raw, spread = moved, torch.minimum(torch.maximum(deviation, NARROW * problem.longest), widest)
+        if converged or not rounds_left:
+            linear = at.linear._replace(residual=at.linear.residual + at.linear.jacobian @ (moved - raw))
+            final = levenberg_marquardt.evaluate_point(problem, moved, linear)._replace(converged=converged)
+            simulations = len(cloud.samples) * len(objective.episodes)
+            return SampledFit(final, _influence(objective, samples, raw), covariance, simulations)
+        raw, spread = moved, torch.minimum(torch.maximum(deviation, narrowest), widest)
 
 
-def _seen_only(problem: levenberg_marquardt.Problem, at: Iterate) -> Iterate:
-    """Without slopes that are no larger than their own errors: those of unknowns that ripples hide."""
-    weight, linear = at.influence()[0], at.linear
-    if linear.wobble is None or linear.blur is None:
+def _drop_insignificant_slopes(problem: levenberg_marquardt.Problem, at: Iterate) -> Iterate:
+    """Set slopes to zero that are no larger than their own errors: ripples hide these unknowns."""
+    weight, linear = at.row_weights()[0], at.linear
+    if linear.simulation_variance is None or linear.slope_covariance is None:
         return at
     size = weight @ linear.jacobian.square()
-    error = (weight * linear.wobble).sum() * linear.blur.diagonal()
-    jacobian = torch.where(size > SEEN * error, linear.jacobian, 0.0)
-    return levenberg_marquardt.judged(problem, at.raw, linear._replace(jacobian=jacobian))
+    error = (weight * linear.simulation_variance).sum() * linear.slope_covariance.diagonal()
+    jacobian = torch.where(size > SAMPLING_SETTINGS.min_slope_to_error * error, linear.jacobian, 0.0)
+    return levenberg_marquardt.evaluate_point(problem, at.raw, linear._replace(jacobian=jacobian))
 
 
-def _downhill(objective: Objective, problem: levenberg_marquardt.Problem, raw: Tensor, step: Tensor) -> Tensor:
-    """As far along a step as the cloth does not come to lie farther off than ripples put it."""
-    now = objective.distance(raw)
-    for _ in range(HALVINGS):
+def _limit_distance(objective: Objective, problem: levenberg_marquardt.Problem, raw: Tensor, step: Tensor) -> Tensor:
+    """Go as far along a step as the cloth does not move farther from the data than ripples would put it."""
+    distance_here = objective.mean_distance(raw)
+    for _ in range(SAMPLING_SETTINGS.max_halvings):
         moved = problem.clip(raw + step)
         try:
-            if not objective.distance(moved) > WORSE * now:
+            if not objective.mean_distance(moved) > SAMPLING_SETTINGS.max_distance_ratio * distance_here:
                 return moved
         except (SimulationDiverged, UnstableStep):
             pass
@@ -192,123 +246,144 @@ def _downhill(objective: Objective, problem: levenberg_marquardt.Problem, raw: T
     return raw
 
 
-class Around:
-    """Makes simulations around points of an objective, and keeps them.
+class SampleCloud:
+    """Makes simulations around points of an objective, and stores them.
 
-    Offsets of held places that are not fitted are drawn by their noise: they scatter, as what is not known does.
+    Grasp offsets that are not fitted are drawn from their noise, so that they scatter as unknown numbers do.
+
+    Args:
+        objective: of all frames.
+        mask: tells which rows count; None: all.
+
+    Attributes:
+        samples: simulations of all rounds.
+        rows: what the rows mean, from the first simulation on.
     """
 
     def __init__(self, objective: Objective, mask: Callable[[Linearised], Tensor] | None) -> None:
         self.objective, self.mask = objective, mask
-        self.wider, self.drawn = with_held_places(objective)
+        self.wider, self.is_sampled_offset = with_grasp_offsets(objective)
         self.samples: list[Sample] = []
-        self.fresh = 0  # number of the first one of this round
-        self.rows: Linearised  # what rows mean, from the first simulation on
+        self.first_of_round = 0
+        self.rows: Linearised
 
     def add(self, raw: Tensor, spread: Tensor) -> None:
-        """Pairs on both sides of ``raw`` [K]; ``spread`` [K]: their standard deviations."""
-        count, self.fresh = len(raw), len(self.samples)
-        for offset in _offsets(count, int(self.drawn.sum()), len(self.samples)):
-            near = self.objective.clip(raw + spread * offset[:count])
+        """Simulate pairs on both sides of ``raw`` [K], with standard deviations ``spread`` [K]."""
+        count, self.first_of_round = len(raw), len(self.samples)
+        extra = self.is_sampled_offset
+        for offset in _offsets(count, int(extra.sum()), len(self.samples)):
+            shifted = self.objective.clip(raw + spread * offset[:count])
             point = self.wider.start.clone()
-            point[~self.drawn], point[self.drawn] = near, offset[count:] * self.wider.prior_std[self.drawn]
+            point[~extra], point[extra] = shifted, offset[count:] * self.wider.prior_std[extra]
             try:
-                self.rows, seen = self.wider.evaluate_all(point), self.wider.seen(point)
+                self.rows, frames = self.wider.evaluate_all(point), self.wider.observe(point)
             except (SimulationDiverged, UnstableStep):
                 continue
-            forces = [w[1:, :3] for frames in seen for w in frames.wrench.values()]
+            forces = [w[1:, :3] for f in frames for w in f.wrench.values()]
             force = torch.cat(forces) if forces else raw.new_zeros(0, 3)
-            value = self.rows.value if self.mask is None else self.rows.value * self.mask(self.rows)
-            self.samples.append(Sample(near, value, torch.cat([frames.x for frames in seen]), force))
+            residual = self.rows.residual if self.mask is None else self.rows.residual * self.mask(self.rows)
+            self.samples.append(Sample(shifted, residual, torch.cat([f.x for f in frames]), force))
 
     def near(self, raw: Tensor, spread: Tensor) -> list[Sample]:
-        """Those that count at a point.
+        """Return the simulations that count at a point.
+
+        Simulations of this round always count: of many unknowns some always lie far out in one.
 
         Raises:
-            SimulationDiverged: too few.
+            SimulationDiverged: too few simulations.
         """
-        earlier = [s for s in self.samples[: self.fresh] if bool(((s.raw - raw).abs() <= NEAR * spread).all())]
-        found = [*earlier, *self.samples[self.fresh :]]  # of many unknowns some always lie far out in one
-        if len(found) < len(raw) + SPARE:
+        reach = SAMPLING_SETTINGS.max_reuse_stds * spread
+        earlier = [s for s in self.samples[: self.first_of_round] if bool(((s.raw - raw).abs() <= reach).all())]
+        samples = [*earlier, *self.samples[self.first_of_round :]]
+        if len(samples) < len(raw) + SAMPLING_SETTINGS.spare_pairs:
             raise SimulationDiverged(
-                f"only {len(found)} simulations around the solution went well",
+                f"only {len(samples)} simulations around the solution went well",
                 remedy="start nearer, or with a smaller dt",
             )
-        return found
+        return samples
 
 
-def line(near: Sequence[Sample], raw: Tensor, like: Linearised) -> Line:
-    """By least squares about ``raw``; rows are divided by their noise, that of the ripples and of the data."""
-    design, value = _design(near, raw), torch.stack([s.value for s in near])
-    solved = torch.linalg.lstsq(design, value).solution
-    scatter = value - design @ solved
-    freedom = len(design) - design.shape[1]
-    wobble = _pooled(scatter.square().sum(0) / freedom, like)
-    weight = _weight(solved[0], wobble, like.kind)
-    inverse = torch.linalg.inv(design.mT @ design)[1:, 1:]
-    linear = like._replace(
-        value=weight * solved[0], jacobian=weight[:, None] * solved[1:].mT, wobble=weight**2 * wobble, blur=inverse
+def regress(samples: Sequence[Sample], raw: Tensor, rows: Linearised) -> LinearRegression:
+    """Fit a straight line through the residuals about ``raw`` [K] by least squares.
+
+    Rows are divided by their noise, which is that of the ripples and of the data.
+    """
+    design, residual = _design_matrix(samples, raw), torch.stack([s.residual for s in samples])
+    solution = torch.linalg.lstsq(design, residual).solution
+    scatter = residual - design @ solution
+    degrees_of_freedom = len(design) - design.shape[1]
+    variance = _pool_variance(scatter.square().sum(0) / degrees_of_freedom, rows)
+    weight = _equalising_weight(solution[0], variance, rows.blocks)
+    linear = rows._replace(
+        residual=weight * solution[0],
+        jacobian=weight[:, None] * solution[1:].mT,
+        simulation_variance=weight**2 * variance,
+        slope_covariance=torch.linalg.inv(design.mT @ design)[1:, 1:],
     )
-    return Line(linear, weight * scatter, freedom)
+    return LinearRegression(linear, weight * scatter, degrees_of_freedom)
 
 
-def _weight(data: Tensor, wobble: Tensor, kind: Tensor) -> Tensor:
-    """[R], so that rows of a kind have equal noise; in its mean it stays as it is."""
-    weight = torch.ones_like(data)
-    for b in kind.unique():
-        own = (kind == b) & (data != 0)
-        if int(own.sum()) > 1:
-            calm = wobble[own] <= wobble[own].median()  # what ripples leave alone shows the sensor's noise
-            floor = noise_scale(data[own][calm], None) ** 2
-            noise = (floor + wobble[own]).sqrt()
-            weight[own] = noise.square().mean().sqrt() / noise
+def _equalising_weight(residual: Tensor, variance: Tensor, block: Tensor) -> Tensor:
+    """[R] weights that give rows of a block equal noise, without a change of its mean square."""
+    weight = torch.ones_like(residual)
+    for b in block.unique():
+        in_block = (block == b) & (residual != 0)
+        if int(in_block.sum()) > 1:
+            is_calm = variance[in_block] <= variance[in_block].median()  # few ripples: shows the sensor's noise
+            floor = noise_scale(residual[in_block][is_calm], None) ** 2
+            noise = (floor + variance[in_block]).sqrt()
+            weight[in_block] = noise.square().mean().sqrt() / noise
     return weight
 
 
-def _offsets(count: int, beside: int, seed: int) -> Tensor:
-    """[N, K + others] in standard deviations: pairs, and columns that are orthogonal among the unknowns."""
-    pairs = count + SPARE
-    draw = torch.randn(pairs, count + beside, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
-    straight = torch.linalg.qr(draw[:, :count])[0] * pairs**0.5
-    half = torch.cat([straight, draw[:, count:]], 1)
+def _offsets(count: int, extra_count: int, seed: int) -> Tensor:
+    """[N, K + extra] in standard deviations: antithetic pairs, with columns orthogonal among the unknowns."""
+    pairs = count + SAMPLING_SETTINGS.spare_pairs
+    generator = torch.Generator().manual_seed(seed)
+    normal = torch.randn(pairs, count + extra_count, generator=generator, dtype=torch.float64)
+    orthogonal = torch.linalg.qr(normal[:, :count])[0] * pairs**0.5
+    half = torch.cat([orthogonal, normal[:, count:]], 1)
     return torch.cat([half, -half])
 
 
-def _design(near: Sequence[Sample], raw: Tensor) -> Tensor:
-    moved = torch.stack([s.raw for s in near]) - raw
-    return torch.cat([torch.ones(len(moved), 1, dtype=moved.dtype), moved], 1)
+def _design_matrix(samples: Sequence[Sample], raw: Tensor) -> Tensor:
+    offsets = torch.stack([s.raw for s in samples]) - raw
+    return torch.cat([torch.ones(len(offsets), 1, dtype=offsets.dtype), offsets], 1)
 
 
-def _pooled(variance: Tensor, like: Linearised) -> Tensor:
-    """[R], means over rows of one kind, frame and patch: each alone is known to little better than a factor of two."""
-    patches = int(like.patch.max()) + 1
-    group = (like.kind * (int(like.frame.max()) + 1) + like.frame) * patches + like.patch
+def _pool_variance(variance: Tensor, rows: Linearised) -> Tensor:
+    """[R] means over rows of one block, frame and error group: each alone is known to a factor of two at best."""
+    groups = int(rows.error_group.max()) + 1
+    group = (rows.blocks * (int(rows.frame.max()) + 1) + rows.frame) * groups + rows.error_group
     total, count = variance.new_zeros(2, int(group.max()) + 1).index_add(
         1, group, torch.stack([variance, torch.ones_like(variance)])
     )
     return (total / count.clamp(min=1))[group]
 
 
-def _by_ripples(problem: levenberg_marquardt.Problem, at: Iterate, found: Line) -> Tensor:
-    """[K, K]: the measured cloth ripples as one more simulation does; so much each of them moves the estimate."""
-    inverse = torch.linalg.inv(levenberg_marquardt.information(problem, at))
-    moved = found.scatter @ (at.influence()[0][:, None] * at.linear.jacobian) @ inverse
-    student = levenberg_marquardt.student(found.freedom) / levenberg_marquardt.NORMAL
-    return student**2 * moved.mT @ moved / found.freedom + inverse @ problem.precision @ inverse
+def _ripple_covariance(problem: levenberg_marquardt.Problem, at: Iterate, regression: LinearRegression) -> Tensor:
+    """[K, K] of the estimate by ripples: the measured cloth ripples as one more simulation does."""
+    inverse = torch.linalg.inv(levenberg_marquardt.information_matrix(problem, at))
+    shifts = regression.scatter @ (at.row_weights()[0][:, None] * at.linear.jacobian) @ inverse
+    degrees = regression.degrees_of_freedom
+    widening = levenberg_marquardt.student_quantile(degrees) / levenberg_marquardt.NORMAL_QUANTILE_975
+    return widening**2 * shifts.mT @ shifts / degrees + inverse @ problem.precision @ inverse
 
 
-def _reach(objective: Objective, near: Sequence[Sample], raw: Tensor) -> Reach:
-    """By regression of the frames and of the forces, less what ripples alone would show."""
-    design, count = _design(near, raw), len(objective.unknowns)
+def _influence(objective: Objective, samples: Sequence[Sample], raw: Tensor) -> ParameterInfluence:
+    """By regression of frames and forces, less what ripples alone would show."""
+    design, count = _design_matrix(samples, raw), len(objective.unknowns)
     error = torch.linalg.pinv(design.mT @ design).diagonal()[1 : count + 1]
 
-    def size(parts: list[Tensor]) -> Tensor:
-        many = torch.stack(parts).to(design).flatten(1)
-        if not many.shape[1]:  # no gripper was felt
-            return many.new_zeros(count)
-        found = torch.linalg.lstsq(design, many).solution
-        slope = found[1 : count + 1].unflatten(1, (-1, 3)).square().sum(-1).mean(1)
-        ripples = 3 * (many - design @ found).square().sum(0).mean() / (len(design) - design.shape[1])
-        return torch.where(slope > SEEN * error * ripples, slope - error * ripples, 0.0).sqrt()
+    def rms_slope(parts: list[Tensor]) -> Tensor:
+        values = torch.stack(parts).to(design).flatten(1)
+        if not values.shape[1]:  # no gripper measured a force
+            return values.new_zeros(count)
+        solution = torch.linalg.lstsq(design, values).solution
+        slope = solution[1 : count + 1].unflatten(1, (-1, 3)).square().sum(-1).mean(1)
+        variance = (values - design @ solution).square().sum(0).mean() / (len(design) - design.shape[1])
+        ripples = 3 * variance
+        is_significant = slope > SAMPLING_SETTINGS.min_slope_to_error * error * ripples
+        return torch.where(is_significant, slope - error * ripples, 0.0).sqrt()
 
-    return Reach(size([s.x for s in near]), size([s.force for s in near]))
+    return ParameterInfluence(rms_slope([s.x for s in samples]), rms_slope([s.force for s in samples]))

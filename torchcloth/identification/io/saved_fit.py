@@ -1,4 +1,4 @@
-"""A fit that was written to disk, as a cloth that can be simulated again."""
+"""Restore a fit from disk as a cloth that can be simulated again."""
 
 from __future__ import annotations
 
@@ -15,265 +15,280 @@ from torch import Tensor
 
 from ...cloth import Cloth
 from ...dynamics.contact import Contact
-from ...episodes.observed import RATE, Episode, cloth_from, episode
+from ...episodes.observed import DEFAULT_FRAME_RATE_HZ, Episode, build_cloth, build_episode
 from ...episodes.replay import Replay
-from ...episodes.unknowns import available
+from ...episodes.unknowns import find_scalar_parameters
 from ...errors import InvalidInput, RecordingError, UnstableStep
 from ...parameters import PhysicalParameter
 from ...recordings import Recording
-from ...recordings.consistency import together
-from ...recordings.fingerprints import alike, mark
-from ..residuals.metrics import figures
-from ..result import Identification, or_none
-from .result_files import number, read_result
-from .unrecorded_settings import beyond
+from ...recordings.consistency import merge_scene
+from ...recordings.fingerprints import fingerprint, same_episode
+from ..residuals.metrics import distance_metrics
+from ..result import IDENTIFICATION_FILE_NAME, IDENTIFICATION_SCHEMA, Identification, nan_to_none
+from .result_files import check_number, read_result
+from .unrecorded_settings import find_unrecorded_settings
 
-RESULT = "identification.json"
-MOST = 100.0  # of the logarithm of a spread, which says nothing long before
-Scene = Callable[[Recording], Cloth]  # the cloth that a fit began with, as an episode's
-FRICTION = ".friction"  # of a table, behind its name
-FAITHFUL = 0.02  # relative difference of Chamfer between the fit and its replay that other machines explain
-ALIKE = 1e-3  # relative, of thicknesses
-STIFFEST = 1e13  # in SI units: simulated, a fabric of more would take more steps than can be counted
-FEW = 4  # names in a message
-SHORTEST, FINEST = 1e-7, 1e-5  # s, m: no fit ends that takes such steps, or has such a contact grid
+ClothBuilder = Callable[[Recording], Cloth]  # builds the cloth that a fit began with, for an episode
+
+MAX_LOG_SPREAD = 100.0  # of a prior's factor, which says nothing long before
+REPLAY_RELATIVE_TOLERANCE = 0.02  # difference of the Chamfer distance from the fit's that other machines explain
+THICKNESS_RELATIVE_TOLERANCE = 1e-3
+MAX_PARAMETER_VALUE = 1e13  # in SI units; a stiffer fabric would take more steps than can be counted
+MIN_STEP_S = 1e-7  # no fit ends that takes shorter steps
+MIN_CONTACT_SPACING_M = 1e-5  # no fit ends with a finer contact grid
+MAX_NAMES_IN_MESSAGE = 4
+FRICTION_SUFFIX = ".friction"  # of a table's parameter, after the table's name
+FIT_AGAIN_REMEDY = "run `torchcloth identify` again"
 
 
 @dataclass(frozen=True, eq=False)
-class Replayed:
+class ReplayedEpisode:
     """An episode simulated with fitted values.
 
     Attributes:
         cloth: with all values set.
-        episode: what it was driven by and is compared with.
+        episode: what drives it, and what it is compared with.
         frames: [T, V, 3] m at ``episode.times``.
         chamfer: [frames with points] m, mean distance of each frame's measured points from the simulated surface.
-        fitted: whether the fit used the episode; else this is a prediction.
-        warning: when the distances are not those that the fit had; else empty.
+        was_fitted: whether the fit used the episode; else this is a prediction.
+        warning: that the distances are not those of the fit. Empty where they are.
     """
 
     cloth: Cloth
     episode: Episode
     frames: Tensor
     chamfer: Tensor
-    fitted: bool
+    was_fitted: bool
     warning: str
 
 
-def model_of(cloth: Cloth, fit: Identification, recordings: Sequence[Recording], dt: float | None) -> dict[str, Any]:
-    """What identification.json keeps, beside the estimates, so that ``replayed`` can repeat the simulation."""
-    values = {name: _parameter(cloth, path).value.item() for name, path in available(cloth).items()}
+def describe_model(
+    cloth: Cloth, fit: Identification, recordings: Sequence[Recording], dt: float | None
+) -> dict[str, Any]:
+    """Return the entry "model" of identification.json, with which ``replay_fit`` can repeat the simulation."""
+    values = {name: _parameter(cloth, path).value.item() for name, path in find_scalar_parameters(cloth).items()}
     values |= {name: fit.parameters[name].value for name in fit.keys}
     faces = torch.as_tensor(cloth.mesh.faces)
     episodes = []
     for recording, frames in zip(recordings, fit.frames_after, strict=True):
-        chamfer = figures([frames], [episode(cloth, recording)], faces).chamfer
-        episodes.append({**mark(recording), "chamfer": or_none(chamfer)})
-    contact = None if cloth.contact is None else asdict(cloth.contact)
+        chamfer = distance_metrics([frames], [build_episode(cloth, recording)], faces).chamfer
+        episodes.append({**fingerprint(recording), "chamfer": nan_to_none(chamfer)})
     return {
         "values": values,
         "thickness": getattr(cloth.material, "thickness", None),
-        "contact": contact,
+        "contact": None if cloth.contact is None else asdict(cloth.contact),
         "dt": dt,
-        "beyond": beyond(cloth, together(recordings)),
+        "unrecorded_settings": find_unrecorded_settings(cloth, merge_scene(recordings)),
         "episodes": episodes,
     }
 
 
-def replayed(path: str | Path, recording: Recording, begun: Scene | None = None) -> Replayed:
+def replay_fit(path: str | Path, recording: Recording, build_start: ClothBuilder | None = None) -> ReplayedEpisode:
     """Simulate an episode with the values of a fit.
 
     Args:
         path: identification.json, or the folder that holds it.
-        recording: one of the episodes that were fitted, or another of the same cloth.
-        begun: of a fit that began with a .tcm file: ``diagnosis.start_of(path)``.
+        recording: one of the fitted episodes, or another of the same cloth.
+        build_start: for a fit that began with a .tcm file: ``diagnosis.start_of(path)``.
 
     Raises:
         InvalidInput: there is no such file, or the fit is of another model.
         RecordingError: the file cannot be read, or does not hold what is needed.
     """
-    model = read_saved(path)
-    own = mark(recording)
-    before = [kept["chamfer"] for kept in model.episodes if alike(kept, own)]
-    cloth = rebuilt(path, model, recording, begun)
-    data = episode(cloth, recording, RATE)
-    with torch.no_grad(), step_of(path):
-        frames = Replay(cloth)(data, model.dt).x
-    found = figures([frames], [data], torch.as_tensor(cloth.mesh.faces))
+    fit = read_saved_fit(path)
+    recording_fingerprint = fingerprint(recording)
+    fitted_chamfers = [e["chamfer"] for e in fit.episodes if same_episode(e, recording_fingerprint)]
+    cloth = rebuild_fitted_cloth(path, fit, recording, build_start)
+    data = build_episode(cloth, recording, DEFAULT_FRAME_RATE_HZ)
+    with torch.no_grad(), explain_unstable_step(path):
+        frames = Replay(cloth)(data, fit.dt).x
+    metrics = distance_metrics([frames], [data], torch.as_tensor(cloth.mesh.faces))
     warning = ""
-    if before and abs(found.chamfer - before[0]) > FAITHFUL * before[0]:
-        warning = (
-            f"the simulation is {1e3 * found.chamfer:.2f} mm from the points, the fit was {1e3 * before[0]:.2f}: "
-            "the fitted model had parts that the episode does not describe, or nuisances, which a replay leaves out"
-        )
-    return Replayed(cloth, data, frames, found.per_frame, bool(before), warning)
+    if fitted_chamfers:
+        before = fitted_chamfers[0]
+        if abs(metrics.chamfer - before) > REPLAY_RELATIVE_TOLERANCE * before:
+            warning = (
+                f"the simulation is {1e3 * metrics.chamfer:.2f} mm from the points, the fit was {1e3 * before:.2f}: "
+                "the fitted model had parts that the episode does not describe, or nuisances, which a replay leaves out"
+            )
+    return ReplayedEpisode(cloth, data, frames, metrics.per_frame, bool(fitted_chamfers), warning)
 
 
-def fitted(
-    path: str | Path, recording: Recording, begun: Scene | None = None
+def load_fitted_cloth(
+    path: str | Path, recording: Recording, build_start: ClothBuilder | None = None
 ) -> tuple[Cloth, dict[str, tuple[float, float]]]:
-    """The cloth of any episode with a fit's values, and what the fit leaves open of them.
+    """Build the cloth of an episode with a fit's values, and priors for another fit.
 
     Args:
         path: identification.json, or the folder that holds it.
         recording: an episode of the same cloth, fitted or not.
-        begun: as ``replayed``.
+        build_start: as in ``replay_fit``.
 
     Returns:
-        The cloth, and by name of every fitted parameter (value, spread) as the ``priors`` of ``identify`` take it; the
-        spread of what the data left open is hardly less than that of its prior.
+        The cloth, and by name of every fitted parameter (value, spread), as the ``priors`` of ``identify`` take it. The
+        spread of a parameter that the data left open is hardly narrower than its prior.
 
     Raises:
         InvalidInput: there is no such file, or the fit is of another model.
         RecordingError: the file cannot be read, or does not hold what is needed.
     """
-    model = read_saved(path)
-    cloth = rebuilt(path, model, recording, begun)
-    names, out = available(cloth), {}
-    for name, std in model.stds.items():
-        value = model.values[name]
-        positive = name in names and _parameter(cloth, names[name]).domain == "positive"
-        if name in names and std > 0:
-            out[name] = (value, math.exp(min(std / value, MOST)) if positive else std)
-    return cloth, out
+    fit = read_saved_fit(path)
+    cloth = rebuild_fitted_cloth(path, fit, recording, build_start)
+    paths, priors = find_scalar_parameters(cloth), {}
+    for name, std in fit.stds.items():
+        value = fit.values[name]
+        is_positive = name in paths and _parameter(cloth, paths[name]).domain == "positive"
+        if name in paths and std > 0:
+            priors[name] = (value, math.exp(min(std / value, MAX_LOG_SPREAD)) if is_positive else std)
+    return cloth, priors
 
 
 @dataclass(frozen=True)
-class SavedModel:
-    """What identification.json says of a model and how well it is known.
+class SavedFit:
+    """The model in identification.json, and how well it is known.
 
     Attributes:
         values: by name, fitted or not.
         stds: standard errors of the fitted parameters, by name.
-        beyond: names of what the fitted cloth has and its first episode does not describe.
-        begun: whether the fit began with a .tcm file, which is kept beside it.
+        unrecorded_settings: names of settings of the fitted cloth that its first episode does not describe.
+        has_start_model: whether the fit began with a .tcm file, a copy of which lies in the same folder.
         correlation: [K, K] of the fitted parameters, in the order of ``stds``.
-        thickness: m, with which moduli [Pa] were fitted; None: a file of before does not say.
-        left: m, rms distance that the fit left in its own episodes; NaN where nothing was seen.
+        thickness: m, with which moduli [Pa] were fitted; None: the material has none.
+        misfit_rms: m, rms distance that the fit left in its own episodes; NaN where there were no points.
+        contact: between layers, or None.
+        dt: largest substep [s]; None: the stable one.
+        episodes: fingerprints of the fitted episodes, each with its Chamfer distance [m].
     """
 
     values: dict[str, float]
     stds: dict[str, float]
-    beyond: list[str]
-    begun: bool
+    unrecorded_settings: list[str]
+    has_start_model: bool
     correlation: np.ndarray
     thickness: float | None
-    left: float
+    misfit_rms: float
     contact: Contact | None
     dt: float | None
     episodes: list[dict[str, Any]]
 
 
-def read_saved(path: str | Path) -> SavedModel:
-    """A saved fit: identification.json, or the folder that holds it.
+def read_saved_fit(path: str | Path) -> SavedFit:
+    """Read a saved fit: identification.json, or the folder that holds it.
 
     Raises:
         InvalidInput: there is no such file.
-        RecordingError: it cannot be read, or does not hold what is needed.
+        RecordingError: it cannot be read, has another schema, or does not hold what is needed.
     """
     expected = "parameters, correlation, fit and model, all numbers finite"
-    return read_result(path, RESULT, _model, expected, "run `torchcloth identify` again")
+    return read_result(path, IDENTIFICATION_FILE_NAME, IDENTIFICATION_SCHEMA, _parse_fit, expected, FIT_AGAIN_REMEDY)
 
 
-def _value(name: str, kept: Any) -> float:
-    if abs(found := number(kept, name=name)) > STIFFEST:
-        raise ValueError(f"{name} {found:g}, beyond every fabric in SI units")
-    return found
+def _parse_value(name: str, content: Any) -> float:
+    if abs(value := check_number(content, name=name)) > MAX_PARAMETER_VALUE:
+        raise ValueError(f"{name} {value:g}, beyond every fabric in SI units")
+    return value
 
 
-def _contact(**kept: Any) -> Contact:
-    for name, least in {"spacing": FINEST, "subdivisions": 1, "damping": 0.0, "play": 0.0}.items():
-        if kept.get(name) is not None:
-            number(kept[name], least, f"contact {name}")
-    if not isinstance(kept.get("subdivisions"), int | None) or not isinstance(kept.get("everywhere", False), bool):
-        raise ValueError(f"contact {kept}")
-    return Contact(**kept)
+def _parse_contact(**content: Any) -> Contact:
+    minima = {"spacing": MIN_CONTACT_SPACING_M, "subdivisions": 1, "damping": 0.0, "free_compression": 0.0}
+    for name, minimum in minima.items():
+        if content.get(name) is not None:
+            check_number(content[name], minimum, f"contact {name}")
+    if not isinstance(content.get("subdivisions"), int | None):
+        raise ValueError(f"contact {content}")
+    if not isinstance(content.get("everywhere", False), bool):
+        raise ValueError(f"contact {content}")
+    return Contact(**content)
 
 
-def _model(content: dict[str, Any]) -> SavedModel:
-    model, said, correlation = (content[key] for key in ("model", "parameters", "correlation"))
-    matrix = np.array([[number(row[name], -1.0) for name in correlation] for row in correlation.values()])
+def _parse_fit(content: dict[str, Any]) -> SavedFit:
+    model, parameters, correlation = (content[key] for key in ("model", "parameters", "correlation"))
+    matrix = np.array([[check_number(row[name], -1.0) for name in correlation] for row in correlation.values()])
     if not len(matrix):
         raise ValueError("no fitted parameter in correlation")
     if (np.abs(matrix) > 1 + 1e-9).any() or not np.allclose(matrix, matrix.T) or not np.allclose(matrix.diagonal(), 1):
         raise ValueError("a correlation that is none")
     if unknown := correlation.keys() - model["values"].keys():
         raise ValueError(f"no value of {min(unknown)}")
-    left = content["fit"]["rms_after"]
-    return SavedModel(
-        {str(name): _value(name, value) for name, value in model["values"].items()},
-        {name: number(said[name]["std"], 0.0, f"{name}'s std") for name in correlation},
-        [str(name) for name in model.get("beyond", ())],  # files of before do not say
-        "begun" in model,
-        matrix,
-        None if (thickness := model.get("thickness")) is None else number(thickness, 0.0, "thickness"),
-        math.nan if left is None else number(left, 0.0),
-        None if model["contact"] is None else _contact(**model["contact"]),
-        None if model["dt"] is None else number(model["dt"], SHORTEST, "dt"),
-        [
-            {"name": str(e["name"]), **{key: int(number(e[key], 0, key)) for key in ("frames", "points")}}
+    misfit, thickness = content["fit"]["rms_after"], model["thickness"]
+    return SavedFit(
+        values={str(name): _parse_value(name, value) for name, value in model["values"].items()},
+        stds={name: check_number(parameters[name]["std"], 0.0, f"{name}'s std") for name in correlation},
+        unrecorded_settings=[str(name) for name in model["unrecorded_settings"]],
+        has_start_model="start_model" in model,
+        correlation=matrix,
+        thickness=None if thickness is None else check_number(thickness, 0.0, "thickness"),
+        misfit_rms=math.nan if misfit is None else check_number(misfit, 0.0),
+        contact=None if model["contact"] is None else _parse_contact(**model["contact"]),
+        dt=None if model["dt"] is None else check_number(model["dt"], MIN_STEP_S, "dt"),
+        episodes=[
+            {"name": str(e["name"]), **{key: int(check_number(e[key], 0, key)) for key in ("frames", "points")}}
             | {
-                "mean": np.array([number(x, name="mean") for x in e["mean"]]).reshape(3),
-                "chamfer": math.nan if e["chamfer"] is None else number(e["chamfer"], 0.0),
+                "mean": np.array([check_number(x, name="mean") for x in e["mean"]]).reshape(3),
+                "chamfer": math.nan if e["chamfer"] is None else check_number(e["chamfer"], 0.0),
             }
             for e in model["episodes"]
         ],
     )
 
 
-def is_fitted(path: str | Path, recording: Recording) -> bool:
-    """Whether the fit used this episode: then nothing about it is a prediction, nor new."""
-    own = mark(recording)
-    return any(alike(kept, own) for kept in read_saved(path).episodes)
+def is_fitted_episode(path: str | Path, recording: Recording) -> bool:
+    """Tell whether the fit used this episode: then nothing about it is a prediction."""
+    recording_fingerprint = fingerprint(recording)
+    return any(same_episode(e, recording_fingerprint) for e in read_saved_fit(path).episodes)
 
 
-def rebuilt(path: str | Path, model: SavedModel, recording: Recording, begun: Scene | None = None) -> Cloth:
-    """The cloth that an episode describes, or that ``begun`` makes of it, at the fitted values.
+def rebuild_fitted_cloth(
+    path: str | Path, fit: SavedFit, recording: Recording, build_start: ClothBuilder | None = None
+) -> Cloth:
+    """Build the cloth that an episode describes, or that ``build_start`` makes of it, with the fitted values.
 
     Raises:
         InvalidInput: it has other parameters than the fitted one, or that has more than its own episode describes.
         RecordingError: a value that no such parameter can have.
     """
-    cloth = cloth_from(recording, contact=model.contact) if begun is None else begun(recording)
-    own = getattr(cloth.material, "thickness", None)
-    known = model.thickness
-    if own is not None and known is not None and not math.isclose(own, known, rel_tol=ALIKE):
+    cloth = build_cloth(recording, contact=fit.contact) if build_start is None else build_start(recording)
+    thickness = getattr(cloth.material, "thickness", None)
+    is_same = (
+        thickness is None
+        or fit.thickness is None
+        or math.isclose(thickness, fit.thickness, rel_tol=THICKNESS_RELATIVE_TOLERANCE)
+    )
+    if not is_same:
         raise InvalidInput(
             f"{path}: a fit of cloth of another thickness",
-            got=f"{own:g} m in the episode, {known:g} m in the fit",
+            got=f"{thickness:g} m in the episode, {fit.thickness:g} m in the fit",
             expected="one thickness: moduli [Pa] times it are what a motion shows",
             remedy="correct cloth.thickness in episode.json (0.001 m where it says none), or fit this episode",
         )
-    names = available(cloth)
-    tables = {name for name in model.values if name.endswith(FRICTION)} - names.keys()  # of tables that are not there
-    absent = {name for name in tables if name.removesuffix(FRICTION) not in recording.colliders}
-    beyond = model.beyond if begun is None else ()
-    if other := ((model.values.keys() - absent) ^ names.keys()) | set(beyond):
-        begins = "from Python give begun=diagnosis.start_of(path)" if model.begun else "fit this episode"
+    paths = find_scalar_parameters(cloth)
+    missing_friction = {name for name in fit.values if name.endswith(FRICTION_SUFFIX)} - paths.keys()
+    absent_tables = {name for name in missing_friction if name.removesuffix(FRICTION_SUFFIX) not in recording.colliders}
+    unrecorded = set(fit.unrecorded_settings) if build_start is None else set()
+    if different := ((fit.values.keys() - absent_tables) ^ paths.keys()) | unrecorded:
+        with_start = "from Python give build_start=diagnosis.start_of(path)"
         raise InvalidInput(
             f"{path}: a fit of another model",
-            got=f"{_few(sorted(other))} not alike in both",
+            got=f"{_list_first(sorted(different))} not alike in both",
             expected="the model that the episode describes",
-            remedy=begins,
+            remedy=with_start if fit.has_start_model else "fit this episode",
         )
-    for name in model.values.keys() - absent:
-        value = model.values[name]
+    for name in fit.values.keys() - absent_tables:
         try:
-            _parameter(cloth, names[name]).set(value)
+            _parameter(cloth, paths[name]).set(fit.values[name])
         except InvalidInput as error:
-            raise RecordingError(f"{path}: {error}", remedy="run `torchcloth identify` again") from None
+            raise RecordingError(f"{path}: {error}", remedy=FIT_AGAIN_REMEDY) from None
     return cloth
 
 
-def _few(names: Sequence[str]) -> str:
-    """As many as one reads."""
-    more = len(names) - FEW
-    return ", ".join(names[:FEW]) + (f" and {more} more" if more > 0 else "")
+def _list_first(names: Sequence[str]) -> str:
+    more = len(names) - MAX_NAMES_IN_MESSAGE
+    return ", ".join(names[:MAX_NAMES_IN_MESSAGE]) + (f" and {more} more" if more > 0 else "")
 
 
 @contextmanager
-def step_of(path: str | Path) -> Iterator[None]:
-    """A step that is too long for an episode's mesh is the file's: nobody who reads one has chosen it."""
+def explain_unstable_step(path: str | Path) -> Iterator[None]:
+    """Turn a step that is too long into an error about the file, whose reader has not chosen the step."""
     try:
         yield
     except UnstableStep as error:

@@ -1,4 +1,4 @@
-"""What of a cloth the episode does not describe that it was fitted to: values by name do not bring that back."""
+"""Find settings of a cloth that its episode does not describe: values by name cannot restore them."""
 
 from __future__ import annotations
 
@@ -6,41 +6,45 @@ import torch
 from torch import Tensor
 
 from ...cloth import Cloth
-from ...episodes.observed import cloth_from
-from ...episodes.unknowns import available
+from ...episodes.observed import build_cloth
+from ...episodes.unknowns import find_scalar_parameters
 from ...errors import TorchclothError
 from ...recordings import Recording
 
-SAME = 1e-5  # relative difference that precisions explain
+PRECISION_RELATIVE_TOLERANCE = 1e-5  # relative difference that single precision explains
 
 
-def beyond(cloth: Cloth, recording: Recording) -> list[str]:
-    """Names of what differs from the cloth that the episode describes, whatever the mesh and the named values.
+def find_unrecorded_settings(cloth: Cloth, recording: Recording) -> list[str]:
+    """Return names of settings that differ from the cloth that the episode describes.
 
-    A gravity that leans, a wind, a law, a thickness. Of an episode that describes no cloth at all, nothing.
+    The mesh and the named values do not count. Examples are a tilted gravity, a wind, a law or a thickness. For an
+    episode that describes no cloth at all, the list is empty.
     """
     try:
-        plain = _facts(cloth_from(recording, contact=cloth.contact))
+        described = _list_settings(build_cloth(recording, contact=cloth.contact))
     except TorchclothError:
         return []
-    own = _facts(cloth)
-    return sorted(name for name in own.keys() | plain.keys() if not _alike(own.get(name), plain.get(name)))
+    actual = _list_settings(cloth)
+    names = actual.keys() | described.keys()
+    return sorted(name for name in names if not _is_equal(actual.get(name), described.get(name)))
 
 
-def _facts(cloth: Cloth) -> dict[str, object]:
-    """Kinds of parts, what they keep as numbers and words, and parameters without a public name."""
-    named = {f"{path}.raw" for path in available(cloth).values()}
-    facts: dict[str, object] = {path: type(part).__name__ for path, part in cloth.named_modules() if path}
+def _list_settings(cloth: Cloth) -> dict[str, object]:
+    """Classes of parts, their attributes that are numbers and strings, and parameters without a public name."""
+    named = {f"{path}.raw" for path in find_scalar_parameters(cloth).values()}
+    settings: dict[str, object] = {path: type(part).__name__ for path, part in cloth.named_modules() if path}
     for path, part in cloth.named_modules():
         for name, value in vars(part).items():
             if name != "training" and not name.startswith("_") and isinstance(value, (bool, int, float, str, tuple)):
-                facts[f"{path}.{name}".lstrip(".")] = value
-    return facts | {name: value.detach() for name, value in cloth.named_parameters() if name not in named}
+                settings[f"{path}.{name}".lstrip(".")] = value
+    return settings | {name: value.detach() for name, value in cloth.named_parameters() if name not in named}
 
 
-def _alike(one: object, other: object) -> bool:
-    if isinstance(one, Tensor) and isinstance(other, Tensor):
-        return one.shape == other.shape and torch.allclose(one.double(), other.double(), SAME, 1e-9)
-    if isinstance(one, float) and isinstance(other, float):
-        return abs(one - other) <= SAME * abs(one)
-    return type(one) is type(other) and not isinstance(one, Tensor) and one == other
+def _is_equal(first: object, second: object) -> bool:
+    if isinstance(first, Tensor) and isinstance(second, Tensor):
+        if first.shape != second.shape:
+            return False
+        return torch.allclose(first.double(), second.double(), PRECISION_RELATIVE_TOLERANCE, 1e-9)
+    if isinstance(first, float) and isinstance(second, float):
+        return abs(first - second) <= PRECISION_RELATIVE_TOLERANCE * abs(first)
+    return type(first) is type(second) and not isinstance(first, Tensor) and first == second

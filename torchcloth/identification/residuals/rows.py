@@ -9,41 +9,64 @@ import torch
 from torch import Tensor
 
 from ...episodes.observed import Episode
-from ...episodes.observed_surface import Sheet
+from ...episodes.observed_surface import ObservedSurface
 from ...episodes.replay import Frames
-from ...losses import Hits, closest
+from ...losses import ClosestPoints, find_closest_points
 
 
-class Scene(NamedTuple):
-    """One simulated episode beside what was measured."""
+class SimulatedEpisode(NamedTuple):
+    """One simulated episode with its measurements.
 
-    seen: Frames
-    moved: Frames | None  # derivatives
+    Attributes:
+        frames: the simulation, as it is observed.
+        derivatives: of ``frames`` by the unknowns, with K in front; None: not computed.
+        episode: the measurements.
+        surface: the cloth's surface as data see it.
+        hits: nearest places on the surface of each cloud's points, by frame. The first frame has none, because the
+            simulation starts there.
+    """
+
+    frames: Frames
+    derivatives: Frames | None
     episode: Episode
-    sheet: Sheet
-    hits: dict[int, Hits]  # of the clouds, by frame; not of the first frame, where the simulation was started
+    surface: ObservedSurface
+    hits: dict[int, ClosestPoints]
 
 
-def scene_of(seen: Frames, moved: Frames | None, episode: Episode, sheet: Sheet) -> Scene:
-    """With the places on the surface that the clouds' points are nearest to."""
+def match_points(
+    frames: Frames, derivatives: Frames | None, episode: Episode, surface: ObservedSurface
+) -> SimulatedEpisode:
+    """Find the places on the simulated surface that are nearest to the clouds' points."""
     clouds = {t: cloud for t, cloud in enumerate(episode.clouds) if t > 0 and len(cloud)}
-    hits = {t: closest(cloud, seen.x[t], sheet.faces) for t, cloud in clouds.items()}
-    return Scene(seen, moved, episode, sheet, hits)
+    hits = {t: find_closest_points(cloud, frames.x[t], surface.faces) for t, cloud in clouds.items()}
+    return SimulatedEpisode(frames, derivatives, episode, surface, hits)
 
 
-class Rows(NamedTuple):
-    """Residuals of one kind: measured minus simulated."""
+class ResidualRows(NamedTuple):
+    """Residuals of one kind: measured minus simulated.
 
-    value: Tensor  # [R] m, N or N m
-    jacobian: Tensor | None  # [R, K] per unit of the unconstrained unknowns
-    frame: Tensor  # [R] int64
-    patch: Tensor  # [R] int64, what errs together: a part of the fabric, a piece of the rim, an axis of a sensor
+    Attributes:
+        residual: [R] m, N or N m.
+        jacobian: [R, K] per unit of the unconstrained unknowns; None: not computed.
+        frame: [R] int64.
+        error_group: [R] int64, equal for rows that share their error: a part of the fabric, a piece of the rim, or an
+            axis of a sensor.
+    """
+
+    residual: Tensor
+    jacobian: Tensor | None
+    frame: Tensor
+    error_group: Tensor
 
 
-def joined(parts: Sequence[Rows]) -> Rows | None:
-    """One after the other; None if there are none."""
+def concatenate_rows(parts: Sequence[ResidualRows]) -> ResidualRows | None:
+    """Concatenate rows; return None if there are none."""
     if not parts:
         return None
     jacobians = [p.jacobian for p in parts if p.jacobian is not None]
-    value, frame, patch = (torch.cat([getattr(p, name) for p in parts]) for name in ("value", "frame", "patch"))
-    return Rows(value, torch.cat(jacobians) if jacobians else None, frame, patch)
+    return ResidualRows(
+        torch.cat([p.residual for p in parts]),
+        torch.cat(jacobians) if jacobians else None,
+        torch.cat([p.frame for p in parts]),
+        torch.cat([p.error_group for p in parts]),
+    )

@@ -1,4 +1,4 @@
-"""What tension.json keeps beside the estimates: the law, the errors of its numbers, and how far it misses forces."""
+"""A fitted membrane law with the errors of its numbers and its misfit, as tension.json stores it."""
 
 from __future__ import annotations
 
@@ -16,32 +16,39 @@ from torch import Tensor
 from ...materials import AEP, AbstractMaterial, OrthotropicAEP, StiffeningAEP
 from ...parameters import PhysicalParameter
 from ...recordings import ForceDisplacement
-from ..io.result_files import number, read_result
-from .specimens import AbstractSpecimen, Response, Trellis, Uniaxial, curves
+from ..io.result_files import check_number, read_result
+from .specimens import AbstractSpecimen, Response, Trellis, Uniaxial, compute_responses
 
-RESULT = "tension.json"
-LAWS = {law.__name__: law for law in (AEP, OrthotropicAEP, StiffeningAEP)}
-SHORTEST = 1e-6  # m, of a specimen
-SPECIMENS = {kind.__name__: kind for kind in (Uniaxial, Trellis)}
+TENSION_SCHEMA = "torchcloth.tension/1"
+TENSION_FILE_NAME = "tension.json"
+MATERIALS_BY_NAME = {law.__name__: law for law in (AEP, OrthotropicAEP, StiffeningAEP)}
+SPECIMENS_BY_NAME = {kind.__name__: kind for kind in (Uniaxial, Trellis)}
+MIN_SPECIMEN_LENGTH_M = 1e-6
 
 
 @dataclass(frozen=True)
-class Pulled:
+class FittedTable:
     """One fitted table: its specimen, and how far the law is from its readings.
 
-    ``missed``: root mean square error of the force, over the root of mean times largest rise above the preload; and of
-    the lateral strain, over the root of its mean times largest size; None where not measured. ``left_out``: of the law
-    fitted to the other tables, without what the errors of its numbers explain; None where that was not tried, or they
-    explain it all, which tells nothing of the law.
+    Attributes:
+        angle: rad, from the warp.
+        length: m.
+        width: m.
+        preload: N.
+        strain: the largest.
+        misfit: by kind. For "force": root mean square error over the root of mean times largest rise above the
+            preload. For "lateral": over the root of mean times largest lateral strain. None where not measured.
+        left_out_misfit: misfit of the law that was fitted to the other tables, without the part that the errors of its
+            numbers explain. None where it was not computed, or where they explain all of it.
     """
 
-    angle: float  # rad
-    length: float  # m
-    width: float  # m
-    preload: float  # N
-    strain: float  # largest
-    missed: dict[str, float | None]
-    left_out: dict[str, float | None] | None = None
+    angle: float
+    length: float
+    width: float
+    preload: float
+    strain: float
+    misfit: dict[str, float | None]
+    left_out_misfit: dict[str, float | None] | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,14 +67,16 @@ class TensionModel:
     specimen: AbstractSpecimen
     fitted: list[str]
     covariance: Tensor
-    tables: list[Pulled]
+    tables: list[FittedTable]
 
     def as_dict(self) -> dict[str, Any]:
-        """The entry "model" of tension.json; empty for laws and specimens that cannot be written as numbers."""
+        """Return the entry "model" of tension.json; empty for laws and specimens that numbers cannot describe."""
         law, kind = type(self.material).__name__, type(self.specimen).__name__
-        if LAWS.get(law) is not type(self.material) or SPECIMENS.get(kind) is not type(self.specimen):
+        if MATERIALS_BY_NAME.get(law) is not type(self.material) or SPECIMENS_BY_NAME.get(kind) is not type(
+            self.specimen
+        ):
             return {}
-        values = {name: _plain(getattr(self.material, name)) for name in _arguments(type(self.material))}
+        values = {name: _to_json(getattr(self.material, name)) for name in _argument_names(type(self.material))}
         if None in values.values():
             return {}
         return {
@@ -80,129 +89,143 @@ class TensionModel:
         }
 
     def curve(self, table: ForceDisplacement) -> tuple[Response, Tensor, Tensor]:
-        """What the law reads at a table's displacements; standard errors [N] of force and strain by the covariance."""
+        """Return the law's response at a table's displacements, with standard errors of force [N] and strain [N]."""
         start = torch.stack([self.material.get_submodule(name).raw.detach() for name in self.fitted])  # type: ignore
 
-        def rows(raw: Tensor) -> Tensor:
+        def respond(raw: Tensor) -> Tensor:
             entries = {f"material.{name}.raw": raw[k] for k, name in enumerate(self.fitted)}
-            return torch.stack(curves(self.material, entries, self.specimen, [table])[0])
+            return torch.stack(compute_responses(self.material, entries, self.specimen, [table])[0])
 
-        slopes = torch.autograd.functional.jacobian(rows, start, vectorize=True)  # [2, N, K]
+        slopes = torch.autograd.functional.jacobian(respond, start, vectorize=True)  # [2, N, K]
         variance = torch.einsum("rnk,kl,rnl->rn", slopes, self.covariance, slopes)
         with torch.no_grad():
-            value = Response(*rows(start))
-        force, lateral = variance.clamp(min=0).sqrt()
-        return value, force, lateral
+            response = Response(*respond(start))
+        force_std, lateral_std = variance.clamp(min=0).sqrt()
+        return response, force_std, lateral_std
 
     def preload(self, table: ForceDisplacement) -> tuple[float, float]:
-        """N, of a specimen that was clamped as the fitted ones were, taut by the same strain; and its deviation."""
-        strains = [self.specimen.taut(self.material, table_of(t)) for t in self.tables]
-        mean, spread = float(np.mean(strains)), float(np.std(strains, ddof=1)) if len(strains) > 1 else 0.0
+        """Estimate the preload [N] of a specimen that was clamped as the fitted ones were, and its deviation [N].
+
+        The fitted specimens' strains under their preloads give the mean and the scatter.
+        """
+        strains = [self.specimen.preload_strain(self.material, specimen_of_table(t)) for t in self.tables]
+        mean, scatter = float(np.mean(strains)), float(np.std(strains, ddof=1)) if len(strains) > 1 else 0.0
         if mean == 0:
             return 0.0, 0.0
         with torch.no_grad():
-            at = torch.tensor([mean, mean + spread], dtype=torch.float64)
+            at = torch.tensor([mean, mean + scatter], dtype=torch.float64)
             low, high = self.specimen.respond(self.material, self.material.coefficients(), table, at).force.tolist()
         return low, high - low
 
 
-def missed(table: ForceDisplacement, curve: Response, known: tuple[Tensor, Tensor] | None = None) -> dict[str, Any]:
-    """``Pulled.missed`` of a curve; ``known``: standard errors [N] of force and strain whose share is taken off."""
-    out: dict[str, Any] = {"force": None, "lateral": None}
-    for k, (kind, seen, base) in enumerate(
-        (("force", table.force, table.preload), ("lateral", table.lateral_strain, 0.0))
-    ):
-        if seen is None:
+def force_misfit(
+    table: ForceDisplacement, curve: Response, known: tuple[Tensor, Tensor] | None = None
+) -> dict[str, Any]:
+    """Compute ``FittedTable.misfit`` of a curve.
+
+    Args:
+        table: with readings.
+        curve: of the law.
+        known: standard errors [N] of force and strain, whose part is subtracted.
+    """
+    misfit: dict[str, Any] = {"force": None, "lateral": None}
+    kinds = (("force", table.force, table.preload), ("lateral", table.lateral_strain, 0.0))
+    for k, (kind, measured, base) in enumerate(kinds):
+        if measured is None:
             continue
-        rows = np.isfinite(seen)
-        square = (curve[k].detach().numpy()[rows] - seen[rows]) ** 2
+        rows = np.isfinite(measured)
+        square = (curve[k].detach().numpy()[rows] - measured[rows]) ** 2
         if known is not None:
             square = square - known[k].numpy()[rows] ** 2
             if square.mean() <= 0:
                 continue
-        rise = np.abs(seen[rows] - base)
-        out[kind] = math.sqrt(square.mean() / (rise.mean() * rise.max()))
-    return out
+        rise = np.abs(measured[rows] - base)
+        misfit[kind] = math.sqrt(square.mean() / (rise.mean() * rise.max()))
+    return misfit
 
 
-def table_of(kept: Pulled) -> ForceDisplacement:
-    """The specimen of a fitted table, without its readings."""
-    ends = np.array([0.0, kept.strain * kept.length])
+def specimen_of_table(table: FittedTable) -> ForceDisplacement:
+    """Return the specimen of a fitted table, without its readings."""
     return ForceDisplacement(
-        length=kept.length,
-        width=kept.width,
-        angle=kept.angle,
-        preload=kept.preload,
-        displacement=ends,
+        length=table.length,
+        width=table.width,
+        angle=table.angle,
+        preload=table.preload,
+        displacement=np.array([0.0, table.strain * table.length]),
         force=np.full(2, np.nan),
     )
 
 
-def pulled(tables: Sequence[ForceDisplacement], found: Sequence[Response]) -> list[Pulled]:
-    """Entries of fitted tables."""
+def summarise_tables(tables: Sequence[ForceDisplacement], curves: Sequence[Response]) -> list[FittedTable]:
+    """Return entries of fitted tables, from the law's curves."""
     return [
-        Pulled(float(t.angle), t.length, t.width, t.preload, float(t.strain.max()), missed(t, c))
-        for t, c in zip(tables, found, strict=True)
+        FittedTable(float(t.angle), t.length, t.width, t.preload, float(t.strain.max()), force_misfit(t, c))
+        for t, c in zip(tables, curves, strict=True)
     ]
 
 
-def with_left_out(model: TensionModel, left_out: Sequence[dict[str, float | None]]) -> TensionModel:
-    """With what was missed of each table when it was not fitted."""
-    return replace(model, tables=[replace(t, left_out=m) for t, m in zip(model.tables, left_out, strict=True)])
+def add_left_out_misfit(model: TensionModel, misfits: Sequence[dict[str, float | None]]) -> TensionModel:
+    """Return the model with the misfit of each table when it was left out of the fit."""
+    tables = [replace(t, left_out_misfit=m) for t, m in zip(model.tables, misfits, strict=True)]
+    return replace(model, tables=tables)
 
 
-def read_model(path: str | Path) -> TensionModel:
-    """The model of a saved fit: tension.json, or the folder that holds it.
+def read_tension_model(path: str | Path) -> TensionModel:
+    """Read the model of a saved fit: tension.json, or the folder that holds it.
 
     Raises:
         InvalidInput: there is no such file.
-        RecordingError: it cannot be read, or does not hold what is needed.
+        RecordingError: it cannot be read, has another schema, or does not hold what is needed.
     """
-    expected = f"a law among {', '.join(LAWS)} with its numbers"
-    again = "fit again with fit_tension and save"
-    return read_result(path, RESULT, lambda content: _model(content["model"]), expected, again)
+    expected = f"a law among {', '.join(MATERIALS_BY_NAME)} with its numbers"
+    remedy = "fit again with fit_tension and save"
+    return read_result(
+        path, TENSION_FILE_NAME, TENSION_SCHEMA, lambda content: _parse_model(content["model"]), expected, remedy
+    )
 
 
-def _model(kept: dict[str, Any]) -> TensionModel:
-    names = [str(name) for name in kept["fitted"]]
+def _parse_model(content: dict[str, Any]) -> TensionModel:
+    names = [str(name) for name in content["fitted"]]
     values: dict[str, Any] = {
-        name: value if isinstance(value, str) else number(value, name=name) for name, value in kept["values"].items()
+        name: value if isinstance(value, str) else check_number(value, name=name)
+        for name, value in content["values"].items()
     }
-    material = LAWS[kept["material"]](**values).to(torch.float64)
+    material = MATERIALS_BY_NAME[content["material"]](**values).to(torch.float64)
     for name in names:
         if not isinstance(getattr(material, name), PhysicalParameter):
             raise ValueError(f"{name} is no parameter")
-    rows = [[number(value, name="covariance") for value in row] for row in kept["covariance"]]
+    rows = [[check_number(value, name="covariance") for value in row] for row in content["covariance"]]
     if [len(row) for row in rows] != [len(names)] * len(names):
         raise ValueError(f"a covariance of {len(rows)} rows, fitted are {len(names)} numbers")
     covariance = torch.tensor(rows, dtype=torch.float64)
     if bool((covariance.diagonal() < 0).any()):
         raise ValueError("a negative variance")
-    tables = [_pulled(table) for table in kept["tables"]]
+    tables = [_parse_table(table) for table in content["tables"]]
     if not tables:
         raise ValueError("no tables")
-    return TensionModel(material, SPECIMENS[kept["specimen"]](), names, covariance, tables)
+    return TensionModel(material, SPECIMENS_BY_NAME[content["specimen"]](), names, covariance, tables)
 
 
-def _pulled(kept: dict[str, Any]) -> Pulled:
-    number(kept["angle"], name="angle")
-    for name, least in {"length": SHORTEST, "width": SHORTEST, "preload": 0.0, "strain": 0.0}.items():
-        number(kept[name], least, name)
-    left_out = kept.get("left_out")
-    for missed in (kept["missed"], *([] if left_out is None else [left_out])):
+def _parse_table(content: dict[str, Any]) -> FittedTable:
+    check_number(content["angle"], name="angle")
+    minima = {"length": MIN_SPECIMEN_LENGTH_M, "width": MIN_SPECIMEN_LENGTH_M, "preload": 0.0, "strain": 0.0}
+    for name, minimum in minima.items():
+        check_number(content[name], minimum, name)
+    left_out = content.get("left_out_misfit")
+    for misfit in (content["misfit"], *([] if left_out is None else [left_out])):
         for name in ("force", "lateral"):
-            if missed[name] is not None:
-                number(missed[name], 0.0, f"missed {name}")
-    return Pulled(**kept)
+            if misfit[name] is not None:
+                check_number(misfit[name], 0.0, f"misfit {name}")
+    return FittedTable(**content)
 
 
-def _arguments(law: type[AbstractMaterial]) -> list[str]:
-    """Of the constructor; a lasting set is refused by specimens anyway."""
+def _argument_names(law: type[AbstractMaterial]) -> list[str]:
+    """Of the constructor; specimens refuse plasticity."""
     return [name for name in inspect.signature(law).parameters if name != "plastic"]
 
 
-def _plain(value: Any) -> float | str | None:
-    """As JSON; None for a value per triangle."""
+def _to_json(value: Any) -> float | str | None:
+    """A number or string; None for a value per triangle."""
     if isinstance(value, PhysicalParameter):
         return float(value.value) if value.raw.ndim == 0 else None
     return value

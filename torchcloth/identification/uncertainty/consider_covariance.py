@@ -1,7 +1,7 @@
-"""Errors that were not fitted, and yet widen the error bars.
+"""Covariance of a solution, with errors that were not fitted and yet widen the error bars (consider analysis).
 
-Where grippers hold the cloth, the noise of a measured first shape stays: it is not damped out as elsewhere. A sheet
-that is held half a millimetre too far apart shows a force from which its stiffness seems some per cent larger.
+The noise of a measured first shape is damped out, but not where grippers hold the cloth. A sheet that is held half a
+millimetre too far apart shows a force that makes its stiffness seem some per cent larger.
 """
 
 from __future__ import annotations
@@ -11,63 +11,74 @@ from torch import Tensor
 
 from ...boundaries import Grasp
 from ..estimators import levenberg_marquardt
-from ..estimators.linearity import Checked
+from ..estimators.linearity import LinearityCheck
 from ..estimators.objective import Objective
-from ..nuisances import Held
-from .replicates import FEWEST, scatter
+from ..nuisances import GraspOffset
+from .replicates import MIN_REPLICATES, jackknife_variance
 
 
-def covariance_of(objective: Objective, checked: Checked, strata: Tensor | None = None) -> Tensor:
-    """[K, K] of a solution, held places and episodes' scatter included; ``strata`` [E]: ``replicates.strata_of``."""
+def solution_covariance(objective: Objective, checked: LinearityCheck, strata: Tensor | None = None) -> Tensor:
+    """Compute the covariance [K, K] of a solution, grasp offsets and the scatter between episodes included.
+
+    Args:
+        objective: of the frames that were used.
+        checked: the solution.
+        strata: [E] groups of replicates (``replicates.assign_strata``); None: all episodes are one group.
+    """
     final = checked.final
     problem, count = objective.problem(), len(objective.episodes)
-    known = checked.covariance
-    own = levenberg_marquardt.covariance(problem, final) if known is None else known
-    if count >= FEWEST:
+    sampled = checked.covariance
+    covariance = levenberg_marquardt.covariance(problem, final) if sampled is None else sampled
+    if count >= MIN_REPLICATES:
         strata = torch.zeros(count, dtype=torch.int64) if strata is None else strata
-        spread = scatter(problem, final, objective.episode_of(final.linear), strata)
-        spread[len(objective.unknowns) :] = 0.0  # an episode's own nuisance is lost without it, and scatters nowhere
-        own = levenberg_marquardt.at_least(own, spread)
-    if known is not None or checked.withdrawn:  # of what is withdrawn nothing will be used
-        return own
-    if not final.converged:  # the answer of a search that was cut short is as uncertain as the way that is left
+        scatter = jackknife_variance(problem, final, objective.episode_of_rows(final.linear), strata)
+        scatter[len(objective.unknowns) :] = 0.0  # without its episode a nuisance has no data, and no scatter
+        covariance = levenberg_marquardt.inflate_covariance(covariance, scatter)
+    if sampled is not None or checked.is_withdrawn:  # a withdrawn solution is not used
+        return covariance
+    if not final.converged:  # a search that was cut short is as uncertain as the remaining step
         gradient, hessian = levenberg_marquardt.normal_equations(problem, final)
-        left = torch.linalg.solve(hessian, gradient)
-        own = levenberg_marquardt.at_least(own, own.diagonal() + left.square())
-    return with_first_shape(objective, final, own)
+        remaining = torch.linalg.solve(hessian, gradient)
+        variances = covariance.diagonal() + remaining.square()
+        covariance = levenberg_marquardt.inflate_covariance(covariance, variances)
+    return add_initial_shape_noise(objective, final, covariance)
 
 
-def with_first_shape(objective: Objective, final: levenberg_marquardt.Iterate, covariance: Tensor) -> Tensor:
-    """The covariance [K, K] widened by the noise of the held places, as a considered parameter (Schmidt 1966).
+def add_initial_shape_noise(objective: Objective, final: levenberg_marquardt.Iterate, covariance: Tensor) -> Tensor:
+    """Widen a covariance [K, K] by the noise of the held vertices, as a considered parameter (Schmidt 1966).
 
     Nothing is added where the offset was fitted, or where the first shape or its noise are not measured.
     """
-    wider, considered = with_held_places(objective)
+    wider, is_considered = with_grasp_offsets(objective)
     if wider is objective:
         return covariance
     raw = wider.start.clone()
-    raw[~considered] = final.raw
-    slopes = wider.linearise(raw).jacobian[:, considered]
-    weighted = final.influence()[0][:, None] * final.linear.jacobian
-    moved = torch.linalg.solve(levenberg_marquardt.information(objective.problem(), final), weighted.mT @ slopes)
-    moved = moved * wider.prior_std[considered]
-    return covariance + moved @ moved.mT
+    raw[~is_considered] = final.raw
+    slopes = wider.linearise(raw).jacobian[:, is_considered]
+    weighted = final.row_weights()[0][:, None] * final.linear.jacobian
+    information = levenberg_marquardt.information_matrix(objective.problem(), final)
+    sensitivity = torch.linalg.solve(information, weighted.mT @ slopes) * wider.prior_std[is_considered]
+    return covariance + sensitivity @ sensitivity.mT
 
 
-def with_held_places(objective: Objective) -> tuple[Objective, Tensor]:
-    """The same with offsets of the held places among the unknowns, and which of those [K] these are.
+def with_grasp_offsets(objective: Objective) -> tuple[Objective, Tensor]:
+    """Add offsets of the grasps to the unknowns of an objective.
 
-    Each held vertex is taken to carry the noise of one point. The objective itself where the offset is fitted, or where
-    the first shape or its noise are not measured.
+    Each held vertex is taken to carry the noise of one point.
+
+    Returns:
+        The wider objective, and which of its unknowns [K] are these offsets. The objective itself where the offset is
+        fitted, or where the first shape or its noise are not measured.
     """
-    fitted = any(nuisance.name == Held.name for nuisance in objective.nuisances)
-    held = [len(part.index) for part in objective.cloth.boundaries.values() if isinstance(part, Grasp)]
-    noises = [e.noise if e.settles and e.noise else 0.0 for e in objective.episodes]
-    if fitted or not held or max(noises) == 0.0:
+    is_fitted = any(nuisance.name == GraspOffset.name for nuisance in objective.nuisances)
+    vertex_counts = [len(part.index) for part in objective.cloth.boundaries.values() if isinstance(part, Grasp)]
+    noises = [e.noise_std if e.needs_settling and e.noise_std else 0.0 for e in objective.episodes]
+    if is_fitted or not vertex_counts or max(noises) == 0.0:
         return objective, torch.zeros(len(objective.start), dtype=torch.bool)
-    wider = objective.beside([*objective.nuisances, Held(max(noises) / min(held) ** 0.5)])
-    considered = torch.zeros(len(wider.start), dtype=torch.bool)
-    for own in wider.placed:
-        for p in own:
-            considered[p.where] = p.nuisance.name == Held.name
-    return wider, considered
+    offset = GraspOffset(max(noises) / min(vertex_counts) ** 0.5)
+    wider = objective.with_nuisances([*objective.nuisances, offset])
+    is_considered = torch.zeros(len(wider.start), dtype=torch.bool)
+    for slices in wider.nuisance_slices:
+        for s in slices:
+            is_considered[s.index] = s.nuisance.name == GraspOffset.name
+    return wider, is_considered

@@ -1,8 +1,9 @@
-"""What the data can tell: how far each parameter moves the cloth, what shows only together, and what would help."""
+"""What the data can determine: how far each parameter moves the cloth, which are confounded, and what would help."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from fnmatch import fnmatch
 from typing import NamedTuple
 
@@ -10,12 +11,28 @@ import torch
 from torch import Tensor
 
 from ...episodes.unknowns import Unknown
-from .estimates import Combination, Estimate, Influence
+from .estimates import Combination, Estimate, InfluenceStatement
 
-TENTH = 0.1
-KNOWN = 0.25  # relative error below which a combination is called determined
-ROUNDING = 1e-10  # least eigenvalue of a correlation matrix whose inverse means something
-SHOWN, ALONE = 0.3, 0.95  # shares of a combination: named from, taken as a parameter of its own from
+
+@dataclass(frozen=True)
+class CombinationCriteria:
+    """Which combinations of parameters are reported.
+
+    Attributes:
+        max_relative_std: relative error below which a combination counts as determined.
+        min_correlation_eigenvalue: least eigenvalue of a correlation matrix whose inverse means something.
+        min_named_weight: weight in a combination, relative to the largest, from which a parameter is named.
+        max_single_weight: weight from which a combination is one parameter, which has its own estimate.
+    """
+
+    max_relative_std: float = 0.25
+    min_correlation_eigenvalue: float = 1e-10
+    min_named_weight: float = 0.3
+    max_single_weight: float = 0.95
+
+
+COMBINATION_CRITERIA = CombinationCriteria()
+STATED_VALUE_FRACTION = 0.1  # of a parameter's value, whose effect is reported
 
 # What determines a parameter, in the order of the first name that fits.
 EXPERIMENTS = (
@@ -42,67 +59,87 @@ EXPERIMENTS = (
 )
 
 
-class Reach(NamedTuple):
-    """How far a unit of each unknown [K] moves the cloth and its forces, root mean square."""
+class ParameterInfluence(NamedTuple):
+    """How far a unit of each unknown [K] moves the cloth and its forces, root mean square.
 
-    position: Tensor  # m, over vertices and frames
-    force: Tensor  # N, over grippers and frames
+    Attributes:
+        position: [K] m, over vertices and frames.
+        force: [K] N, over grippers and frames.
+    """
+
+    position: Tensor
+    force: Tensor
 
 
-def influences(
-    unknowns: Sequence[Unknown], raw: Tensor, reach: Reach, estimates: Mapping[str, Estimate]
-) -> dict[str, Influence]:
-    """By the parameter's name."""
+def describe_influences(
+    unknowns: Sequence[Unknown], raw: Tensor, influence: ParameterInfluence, estimates: Mapping[str, Estimate]
+) -> dict[str, InfluenceStatement]:
+    """Describe by parameter name how far each unknown moves the cloth, and what would determine it."""
     out = {}
     for k, unknown in enumerate(unknowns):
-        tenth, prior = TENTH * _relative(unknown, float(raw[k])), unknown.prior_std
-        position, force = 1e3 * float(reach.position[k]), float(reach.force[k])
+        prior, fraction = unknown.prior_std, STATED_VALUE_FRACTION * _raw_change_per_value(unknown, float(raw[k]))
+        position_mm, force = 1e3 * float(influence.position[k]), float(influence.force[k])
         identifiable = estimates[unknown.name].identifiable
         statement = "identified" if identifiable else "not identifiable from these data"
-        if position == 0.0 and force == 0.0:
+        if position_mm == 0.0 and force == 0.0:
             statement = "no effect on these data"
-        experiment = "" if identifiable else experiment_for(unknown.name)
-        out[unknown.name] = Influence(
-            identifiable, statement, position * prior, position * tenth, force * prior, force * tenth, experiment
+        out[unknown.name] = InfluenceStatement(
+            identifiable=identifiable,
+            statement=statement,
+            displacement_per_prior_std_mm=position_mm * prior,
+            displacement_per_10_percent_mm=position_mm * fraction,
+            force_per_prior_std_n=force * prior,
+            force_per_10_percent_n=force * fraction,
+            experiment="" if identifiable else suggest_experiment(unknown.name),
         )
     return out
 
 
-def combinations(unknowns: Sequence[Unknown], raw: Tensor, covariance: Tensor) -> list[Combination]:
-    """Eigenvectors of the data's information in relative coordinates, best determined first.
+def find_combinations(
+    unknowns: Sequence[Unknown],
+    raw: Tensor,
+    covariance: Tensor,
+    criteria: CombinationCriteria = COMBINATION_CRITERIA,
+) -> list[Combination]:
+    """Return eigenvectors of the data's information in relative coordinates, best determined first.
 
-    Nuisances are allowed for; priors are taken out. Directions that are one parameter are left out. A covariance that
-    is singular to rounding, as of a motion with runaway slopes, has none.
+    Nuisances are allowed for, priors are taken out. Directions that are one parameter are left out. A covariance that
+    is singular to rounding, as for a motion with runaway slopes, has no combinations.
     """
     count = len(unknowns)
     prior = torch.tensor([u.prior_std for u in unknowns], dtype=covariance.dtype)
-    unit = torch.tensor([_relative(u, float(r)) for u, r in zip(unknowns, raw, strict=False)], dtype=covariance.dtype)
-    within = covariance[:count, :count]
-    deviation = within.diagonal().sqrt()
-    correlation = within / deviation[:, None] / deviation
-    if not bool(correlation.isfinite().all()) or float(torch.linalg.eigvalsh(correlation)[0]) < ROUNDING:
+    changes = [_raw_change_per_value(u, float(r)) for u, r in zip(unknowns, raw, strict=False)]
+    unit = torch.tensor(changes, dtype=covariance.dtype)
+    fabric = covariance[:count, :count]
+    deviation = fabric.diagonal().sqrt()
+    correlation = fabric / deviation[:, None] / deviation
+    if not bool(correlation.isfinite().all()):
+        return []
+    if float(torch.linalg.eigvalsh(correlation)[0]) < criteria.min_correlation_eigenvalue:
         return []
     information = torch.linalg.inv(correlation) / deviation[:, None] / deviation - torch.diag(prior**-2)
     values, vectors = torch.linalg.eigh(unit[:, None] * information * unit)
     out = []
     for value, vector in zip(values.flip(0), vectors.flip(1).mT, strict=True):
         size = float(vector.abs().max())
-        if size > ALONE or float(value) <= 0:
+        if size > criteria.max_single_weight or float(value) <= 0:
             continue
         vector = vector / vector[vector.abs().argmax()]
-        named = [k for k in vector.abs().argsort(descending=True).tolist() if abs(float(vector[k])) > SHOWN]
+        order = vector.abs().argsort(descending=True).tolist()
+        named = [k for k in order if abs(float(vector[k])) > criteria.min_named_weight]
         if len(named) < 2:
             continue
         std = 1 / (float(value) ** 0.5 * size)
-        out.append(Combination({unknowns[k].name: float(vector[k]) for k in named}, std, std < KNOWN))
+        powers = {unknowns[k].name: float(vector[k]) for k in named}
+        out.append(Combination(powers, std, std < criteria.max_relative_std))
     return out
 
 
-def experiment_for(name: str) -> str:
-    """What would determine a parameter."""
+def suggest_experiment(name: str) -> str:
+    """Return a motion that would determine a parameter."""
     return next((text for pattern, text in EXPERIMENTS if fnmatch(name, pattern)), "a motion that moves it more")
 
 
-def _relative(unknown: Unknown, raw: float) -> float:
-    """Change of the unconstrained number for a change by the value itself; of a typical value, where that is larger."""
-    return max(abs(unknown.value(raw)), unknown.typical) / unknown.slope(raw)
+def _raw_change_per_value(unknown: Unknown, raw: float) -> float:
+    """Change of the unconstrained number for a change by the value itself, or by a typical value that is larger."""
+    return max(abs(unknown.value(raw)), unknown.typical_amplitude) / unknown.slope(raw)

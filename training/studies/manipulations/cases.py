@@ -1,4 +1,4 @@
-"""One manipulation: its first half is fitted, all of it is predicted with what was found."""
+"""A case: the first half of a manipulation is fitted, and all of it is predicted with the estimates."""
 
 from __future__ import annotations
 
@@ -17,24 +17,27 @@ from torchcloth.identification import Identification, identify
 from torchcloth.identification.residuals.rigid_carry import carry_rigidly
 from torchcloth.losses import chamfer_to_surface, chamfer_to_vertices
 
-from .episodes import Seen, record
+from .episodes import Observation, record
 from .scenes import Discretisation, Fabric, Manipulation, Scene
 
-SOUGHT = ("youngs_modulus", "poisson_ratio", "contact_stiffness", "shear_stiffness")  # the paper's four
-FREE = ("bending.stiffness", "air.normal")  # unknown of any garment, and able to pass for the others
+PAPER_PARAMETERS = ("youngs_modulus", "poisson_ratio", "contact_stiffness", "shear_stiffness")  # the paper's four
+EXTRA_PARAMETERS = (
+    "bending.stiffness",
+    "air.normal",
+)  # unknown for any garment, and confounded with the others if they are not fitted
 
 
 @dataclass(frozen=True)
 class Setup:
-    """What all cases of a study share.
+    """Settings that all cases of a study share.
 
     Attributes:
-        triangles: of the fit's garment, about; the truth's has half as many again.
-        gap: m between layers that touch, in the fit; 0.9 of it in the truth.
+        triangles: approximate number in the fit; the truth has 1.5 times as many.
+        gap: distance of layers that touch [m] in the fit; 0.9 of it in the truth.
         rate: frames per second.
-        points: of the cloth, per frame at most.
-        share: of the frames that are fitted: later ones, folded and in contact, have slopes of no use.
-        iterations: of a fit, at most.
+        points: most points of the cloth in a frame.
+        share: fraction of the frames that are fitted; late frames with folds and contact have useless slopes.
+        iterations: most iterations of a fit.
     """
 
     triangles: int = 150
@@ -46,79 +49,85 @@ class Setup:
 
     @property
     def fit(self) -> Discretisation:
-        """Of the model."""
+        """Discretisation of the model."""
         return Discretisation(self.triangles, self.gap)
 
     @property
     def truth(self) -> Discretisation:
-        """Another mesh, grid and step."""
+        """Discretisation of the truth, with another mesh, grid and step."""
         return Discretisation(round(1.5 * self.triangles), 0.9 * self.gap, 0.6)
 
 
-def seen(setup: Setup, what: Manipulation) -> tuple[Scene, Seen]:
-    """The fit's scene, and the recording."""
+def simulate_observation(setup: Setup, what: Manipulation) -> tuple[Scene, Observation]:
+    """Return the fit's scene and the observation of the truth."""
     model = Scene(what, setup.fit)
     return model, record(Scene(what, setup.truth), model, setup.rate, setup.points)
 
 
-def solve(setup: Setup, what: Manipulation) -> dict[str, Any]:
-    """A finished case, plain JSON.
+def solve_case(setup: Setup, what: Manipulation) -> dict[str, Any]:
+    """Fit and predict a case; return plain JSON.
 
-    "manipulation", "truth", "hidden", "found" (estimates), "moves_mm" (how far 10 % of each moves the cloth), "fit",
-    "warnings", and "distance" for the rigid-carry null, the start values and the fitted ones, or "unpredicted":
-    why there is none; or "failed": why.
+    Keys: "manipulation", "truth", "hidden", "estimates", "moves_mm" (motion of the cloth by 10 % of each parameter),
+    "fit", "warnings", and "distance" of the rigid-carry null, the start values and the fitted values. "unpredicted"
+    replaces "distance" if the prediction failed, and "failed" replaces all results if the fit failed.
     """
-    model, data = seen(setup, what)
+    model, data = simulate_observation(setup, what)
     true = Fabric.true(what.garment)
     case = {"manipulation": what.facts(), "truth": true.named(), "hidden": data.hidden, "frames": len(data.x)}
     start, early = model.cloth(true.start()), data.until(setup.share)
     try:
-        fit = identify(start, early.recording, [*SOUGHT, *FREE], iterations=setup.iterations, warm_start=True)
-    except (SimulationDiverged, UnstableStep) as error:
-        return case | {"failed": str(error)}
-    case |= stated(fit)
-    try:
-        return case | {"distance": _distances(setup, model, data, fit)}
-    except (SimulationDiverged, UnstableStep) as error:  # later frames only: what was found stands
-        return case | {"unpredicted": str(error)}
-
-
-def solve_together(setup: Setup, whats: Sequence[Manipulation]) -> dict[str, Any]:
-    """One fit to the first halves of several manipulations of a garment that is held at the same places; as ``solve``.
-
-    Without "distance": nothing is predicted.
-    """
-    both = [seen(setup, what) for what in whats]
-    model, true = both[0][0], Fabric.true(whats[0].garment)
-    case = {"manipulations": [what.facts() for what in whats], "truth": true.named()}
-    recordings = [data.until(setup.share).recording for _, data in both]
-    try:
         fit = identify(
-            model.cloth(true.start()), recordings, [*SOUGHT, *FREE], iterations=setup.iterations, warm_start=True
+            start, early.recording, [*PAPER_PARAMETERS, *EXTRA_PARAMETERS], iterations=setup.iterations, warm_start=True
         )
     except (SimulationDiverged, UnstableStep) as error:
         return case | {"failed": str(error)}
-    return case | stated(fit)
+    case |= extract_fit(fit)
+    try:
+        return case | {"distance": _distances(setup, model, data, fit)}
+    except (SimulationDiverged, UnstableStep) as error:  # in later frames only: the estimates stand
+        return case | {"unpredicted": str(error)}
 
 
-def stated(fit: Identification) -> dict[str, Any]:
-    """What a case keeps of a fit."""
-    found = {
+def solve_together(setup: Setup, manipulations: Sequence[Manipulation]) -> dict[str, Any]:
+    """Fit the first halves of several manipulations of a garment with the same grips; see ``solve_case``.
+
+    There is no "distance", because nothing is predicted.
+    """
+    observations = [simulate_observation(setup, what) for what in manipulations]
+    model, true = observations[0][0], Fabric.true(manipulations[0].garment)
+    case = {"manipulations": [what.facts() for what in manipulations], "truth": true.named()}
+    recordings = [data.until(setup.share).recording for _, data in observations]
+    try:
+        fit = identify(
+            model.cloth(true.start()),
+            recordings,
+            [*PAPER_PARAMETERS, *EXTRA_PARAMETERS],
+            iterations=setup.iterations,
+            warm_start=True,
+        )
+    except (SimulationDiverged, UnstableStep) as error:
+        return case | {"failed": str(error)}
+    return case | extract_fit(fit)
+
+
+def extract_fit(fit: Identification) -> dict[str, Any]:
+    """Return the parts of a fit that a case stores."""
+    estimates = {
         name: {"value": e.value, "std": e.std, "ci95": list(e.ci95), "start": e.initial, "identifiable": e.identifiable}
         for name, e in fit.parameters.items()
-        if name in (*SOUGHT, *FREE)
+        if name in (*PAPER_PARAMETERS, *EXTRA_PARAMETERS)
     }
-    keys = ("iterations", "simulations", "seconds", "points", "independent_observations", "converged")
+    keys = ("iterations", "simulations", "seconds", "points", "effective_observations", "converged")
     return {
-        "found": found,
+        "estimates": estimates,
         "moves_mm": {name: i.displacement_per_10_percent_mm for name, i in fit.influences.items()},
         "fit": {key: fit.fit[key] for key in keys},
         "warnings": fit.warnings,
     }
 
 
-def _distances(setup: Setup, model: Scene, data: Seen, fit: Identification) -> dict[str, dict[str, float]]:
-    """State -> convention -> m, over all frames: most of them were not fitted."""
+def _distances(setup: Setup, model: Scene, data: Observation, fit: Identification) -> dict[str, dict[str, float]]:
+    """Return state -> convention -> distance [m] over all frames, most of which were not fitted."""
     start = Fabric.true(model.what.garment).start()
     fitted = Fabric(*(fit.parameters[name].value for name in start.named()))
     clouds = build_episode(model.cloth(start), data.recording)
@@ -131,10 +140,10 @@ def _distances(setup: Setup, model: Scene, data: Seen, fit: Identification) -> d
 
 
 def distance(x: Tensor, clouds: Episode, truth: Tensor, faces: Tensor) -> dict[str, float]:
-    """Of frames [T, V, 3] m, over all but the first, where the cloth is given.
+    """Compute distances [m] of frames [T, V, 3] m, over all but the first, where the cloth is given.
 
-    "surface": cloud to surface, ours; "vertices": cloud to the nearest vertex, the paper's; "pose": root mean square
-    of the vertices' distances from where they are in truth, hidden ones included.
+    "surface": cloud to surface (ours). "vertices": cloud to the nearest vertex (the paper's). "pose": root mean square
+    distance of all vertices from their true places, hidden ones included.
     """
     rows = [
         (
