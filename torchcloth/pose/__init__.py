@@ -1,4 +1,4 @@
-"""The full mesh of a cloth over time, from recordings that show a part of it."""
+"""Estimate the full mesh of a cloth over time from recordings that show a part of it."""
 
 from .estimate import estimate_pose
 from .result import PoseEstimate

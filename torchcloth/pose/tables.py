@@ -1,4 +1,4 @@
-"""A pose estimate as a table for a terminal."""
+"""Print a pose estimate as a table for a terminal."""
 
 from __future__ import annotations
 
@@ -6,32 +6,37 @@ import math
 
 from .result import PoseEstimate
 
-ROWS = {"null": "null: carried rigidly", "alone": "simulated, no correction", "after": "estimate"}
+MIN_TABLE_WIDTH = 100  # columns of the terminal
+DISTANCE_ROW_LABELS = {
+    "null": "null: carried rigidly",
+    "uncorrected": "simulated, no correction",
+    "after": "estimate",
+}
 
 
 def print_pose(estimate: PoseEstimate) -> None:
-    """Distances, errors, the corrective force, warnings."""
+    """Print distances, errors, the corrective force and warnings."""
     from rich import box
     from rich.console import Console
     from rich.table import Table
 
     console, fit = Console(highlight=False), estimate.fit
-    console.width = max(console.width, 100)
+    console.width = max(console.width, MIN_TABLE_WIDTH)
     table = Table(title="Distance cloud to surface, one-sided, mm", title_justify="left", box=box.SIMPLE_HEAD)
     for heading in ("", "Chamfer", "rms"):
         table.add_column(heading, justify="right" if heading else "left", no_wrap=True)
-    for key, label in ROWS.items():
+    for key, label in DISTANCE_ROW_LABELS.items():
         numbers = (1e3 * fit[f"{what}_{key}"] for what in ("chamfer", "rms"))
         table.add_row(label, *("–" if math.isnan(number) else f"{number:.2f}" for number in numbers))
     console.print(table)
-    hidden = ~estimate.seen
-    size = estimate.std.square().sum(-1)
-    parts = (("seen", estimate.seen), ("hidden", hidden))
-    errors = [f"{name} {1e3 * float(size[own].mean().sqrt()):.1f} mm" for name, own in parts if bool(own.any())]
-    console.print(f"standard error of a vertex, rms: {', '.join(errors)}; {100 * fit['seen_share']:.0f} % were seen")
+    squared = estimate.std.square().sum(-1)
+    parts = (("seen", estimate.seen), ("hidden", ~estimate.seen))
+    errors = [f"{name} {1e3 * float(squared[rows].mean().sqrt()):.1f} mm" for name, rows in parts if bool(rows.any())]
+    console.print(f"standard error of a vertex, rms: {', '.join(errors)}; {100 * fit['seen_fraction']:.0f} % were seen")
     console.print(
-        f"corrective force: {100 * fit['force_share']:.1f} % of the weight (rms), at most "
-        f"{100 * fit['force_share_max']:.1f} % in one of {len(estimate.shares)} windows; {fit['seconds']:.0f} s"
+        f"corrective force: {100 * fit['force_fraction']:.1f} % of the weight (rms), at most "
+        f"{100 * fit['force_fraction_max']:.1f} % in one of {len(estimate.force_fractions)} windows; "
+        f"{fit['seconds']:.0f} s"
     )
     for name, e in {**estimate.parameters, **estimate.nuisances}.items():
         console.print(f"{name}: {e.value:.4g} ± {e.std:.2g} {e.unit}", markup=False)

@@ -1,4 +1,4 @@
-"""What to mistrust in a pose estimate."""
+"""Warnings of a pose estimate: what to mistrust."""
 
 from __future__ import annotations
 
@@ -9,59 +9,70 @@ import torch
 from torch import Tensor
 
 from ..episodes.observed import Episode
-from .fine_scale_uncertainty import FEWEST
+from .fine_scale_uncertainty import FINE_SCALE_SETTINGS
 
-LARGE = 0.1  # of the weight, from which a corrective force says that the model is wrong
-MISSED = 1.3  # rms over the stated noise
-BLIND = 0.3  # s without anything seen or felt
+MAX_FORCE_FRACTION = 0.1  # of the weight; a larger corrective force says that the model is wrong
+MAX_POINT_NOISE_RATIO = 1.3  # rms residual over the stated noise
+MAX_GAP_S = 0.3  # duration without any data
 
 
-def warnings_of(
+def pose_warnings(
     fit: Mapping[str, Any],
-    shares: Tensor,
+    force_fractions: Tensor,
     seen: Tensor,
-    data: Episode,
+    episode: Episode,
     windows: Sequence[Tensor],
     noise: float | None,
-    holds: int,
+    predictable_frames: int,
 ) -> list[str]:
-    """Sentences; ``noise``: of a point, as it was given [m]; ``holds``: frames in which tangents describe a motion."""
-    out = []
-    if fit["force_share"] > LARGE:
-        first, last = windows[int(shares.argmax())].tolist()
-        out.append(
-            f"the model is wrong: it takes a corrective force of {100 * fit['force_share']:.0f} % of the weight (rms; "
-            f"{100 * fit['force_share_max']:.0f} % in {first:.2f}-{last:.2f} s) to follow what was seen: identify the "
-            "fabric, or state how uncertain its values are; the standard errors are at their least"
+    """List what to mistrust in an estimate, in sentences.
+
+    Args:
+        fit: its distances and fractions.
+        force_fractions: [W] corrective force over weight.
+        seen: [T, V] bool.
+        episode: with the data that were used.
+        windows: W pairs of times [s].
+        noise: stated standard deviation of a point [m], or None.
+        predictable_frames: number of frames in which tangents describe a motion.
+    """
+    warnings = []
+    if fit["force_fraction"] > MAX_FORCE_FRACTION:
+        first, last = windows[int(force_fractions.argmax())].tolist()
+        warnings.append(
+            f"the model is wrong: it takes a corrective force of {100 * fit['force_fraction']:.0f} % of the weight "
+            f"(rms; {100 * fit['force_fraction_max']:.0f} % in {first:.2f}-{last:.2f} s) to follow the data: identify "
+            "the fabric, or state how uncertain its values are; the standard errors are at their least"
         )
-    if noise and fit["point_noise"] > MISSED * noise:
-        out.append(
-            f"seen points are {1e3 * fit['point_noise']:.1f} mm off the estimate, {1e3 * noise:.1f} mm would be "
+    if noise and fit["point_noise"] > MAX_POINT_NOISE_RATIO * noise:
+        warnings.append(
+            f"measured points are {1e3 * fit['point_noise']:.1f} mm off the estimate, {1e3 * noise:.1f} mm would be "
             "noise: shapes finer than the correction's modes are missed"
         )
     if fit["chamfer_after"] >= fit["chamfer_null"]:
-        out.append("no better than a cloth that is carried rigidly: do not use this estimate")
-    if holds < len(data.times):
-        out.append(
-            f"the motion is unstable: from {float(data.times[max(holds - 1, 0)]):.2f} s on pushes of the size that is "
-            "expected grow beyond the cloth: the estimate is one of many motions, which no standard error covers"
+        warnings.append("no better than a cloth that is carried rigidly: do not use this estimate")
+    if predictable_frames < len(episode.times):
+        start = float(episode.times[max(predictable_frames - 1, 0)])
+        warnings.append(
+            f"the motion is unstable: from {start:.2f} s on pushes of the size that is expected grow beyond the "
+            "cloth: the estimate is one of many motions, which no standard error covers"
         )
     elif not fit["converged"]:
-        out.append("the search did not converge: another estimate may fit as well")
-    if (count := sum(len(cloud) for cloud in data.clouds)) < FEWEST:
-        seen_points = f"only {count} points" if count else "no points"
-        out.append(f"{seen_points} were seen: shapes finer than the correction's modes are in no standard error")
-    felt = torch.zeros(len(data.times), dtype=torch.bool)
-    for wrench in data.wrenches.values():
-        felt |= wrench.isfinite().any(-1)
-    blind = _longest_gap(data.times, seen.any(1) | felt)
-    if blind > BLIND:
-        out.append(f"nothing was seen or felt for {blind:.2f} s: there the estimate is simulation alone")
-    return out + data.doubts()
+        warnings.append("the search did not converge: another estimate may fit as well")
+    if (count := sum(len(cloud) for cloud in episode.clouds)) < FINE_SCALE_SETTINGS.min_points:
+        points = f"only {count} points" if count else "no points"
+        warnings.append(f"{points} were seen: shapes finer than the correction's modes are in no standard error")
+    has_force = torch.zeros(len(episode.times), dtype=torch.bool)
+    for wrench in episode.wrenches.values():
+        has_force |= wrench.isfinite().any(-1)
+    gap = _longest_gap(episode.times, seen.any(1) | has_force)
+    if gap > MAX_GAP_S:
+        warnings.append(f"there are no data for {gap:.2f} s: there the estimate is simulation alone")
+    return warnings + episode.data_warnings()
 
 
-def _longest_gap(times: Tensor, any_seen: Tensor) -> float:
-    """[s] between frames in which something was seen, or felt."""
-    at = times[any_seen | (torch.arange(len(times)) == 0)]
+def _longest_gap(times: Tensor, has_data: Tensor) -> float:
+    """Longest duration between frames with data [s]."""
+    at = times[has_data | (torch.arange(len(times)) == 0)]
     ends = torch.cat([at, times[-1:]])
     return float((ends[1:] - ends[:-1]).max())

@@ -32,7 +32,7 @@ def film_from_pose(recording: Recording, estimate: PoseEstimate, *, truth: bool 
     outlines = {name: replace(sheet, outline=True) for name, sheet in film.sheets.items()}
     return replace(
         film,
-        title=f"{film.title}: pose, corrective force {100 * estimate.fit['force_share']:.1f} % of the weight",
+        title=f"{film.title}: pose, corrective force {100 * estimate.fit['force_fraction']:.1f} % of the weight",
         sheets={**outlines, "cloth": ClothSurface(x, estimate.faces.numpy(), np.where(seen, np.nan, error))},
         colour_limit=colour_limit,
         legend="standard error, hidden vertices",

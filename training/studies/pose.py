@@ -19,6 +19,7 @@ from torch import Tensor
 
 import torchcloth as tc
 from torchcloth import identification, viewing
+from torchcloth._utils.constants import Z_95
 from torchcloth._utils.files import write_text
 from torchcloth.effects import AirDrag, Bending, Gravity
 from torchcloth.errors import InvalidInput
@@ -67,7 +68,9 @@ def add(parser: argparse.ArgumentParser) -> None:
 def run(options: argparse.Namespace) -> None:
     """Estimate each motion with each model; print a table and write a picture."""
     setting = FAST_SETTING if options.fast else Setting()
-    study = ResumableStudy(options.out, {"study": "pose", **{key: _plain(value) for key, value in setting._asdict().items()}})
+    study = ResumableStudy(
+        options.out, {"study": "pose", **{key: _plain(value) for key, value in setting._asdict().items()}}
+    )
     study.start()
     cases: dict[str, Callable[[], dict[str, Any]]] = {}
     for motion in setting.motions:
@@ -105,7 +108,15 @@ def _scene(out: Path, setting: Setting, motion: str) -> Scene:
     if not path.is_dir():
         effects = [part for effect in GENERATOR_EFFECTS for part in ("--effect", effect)]
         sizes = ["--nodes", str(setting.nodes), "--fit-nodes", str(setting.fit)]
-        script = [sys.executable, "-m", "torchcloth.training.validation.independent.generate", "--motion", motion, "--seed", "1"]
+        script = [
+            sys.executable,
+            "-m",
+            "torchcloth.training.validation.independent.generate",
+            "--motion",
+            motion,
+            "--seed",
+            "1",
+        ]
         done = subprocess.run([*script, *sizes, *effects, "--out", str(path)], capture_output=True, text=True)
         if done.returncode:
             raise InvalidInput("validation.independent.generate", got=done.stderr.strip()[-300:])
@@ -151,7 +162,10 @@ def _model(recording: Recording, name: str) -> tuple[tc.Cloth, Uncertain]:
     if name == "identified":
         return _identified(wrong, recording)
     stiffness = float(_stiffness(wrong).value.detach())
-    return wrong, {"youngs_modulus": (stiffness, 2.0), "air.normal": (0.5 * TRUE_DRAG_COEFFICIENT, 0.5 * TRUE_DRAG_COEFFICIENT)}
+    return wrong, {
+        "youngs_modulus": (stiffness, 2.0),
+        "air.normal": (0.5 * TRUE_DRAG_COEFFICIENT, 0.5 * TRUE_DRAG_COEFFICIENT),
+    }
 
 
 def _identified(start: tc.Cloth, recording: Recording) -> tuple[tc.Cloth, Uncertain]:
@@ -214,7 +228,7 @@ def _coverage(result: PoseEstimate, scene: Scene, free: Tensor) -> dict[str, flo
 
 
 def _figures(result: PoseEstimate) -> dict[str, Any]:
-    names = ("std_rms", "force_share", "seconds", "converged")
+    names = ("std_rms", "force_fraction", "seconds", "converged")
     return {**{name: result.fit[name] for name in names}, "warnings": result.warnings}
 
 
@@ -240,7 +254,7 @@ def _rows(name: str, case: Mapping[str, Mapping[str, Any]]) -> list[tuple[str, .
         coverage_cells = ("–",) * 4
         if "coverage" in values:
             shares = (_shown(values[key], 3) for key in ("coverage", "coverage_hidden"))
-            coverage_cells = (*shares, f"{1e3 * values['std_rms']:.2f}", f"{100 * values['force_share']:.1f} %")
+            coverage_cells = (*shares, f"{1e3 * values['std_rms']:.2f}", f"{100 * values['force_fraction']:.1f} %")
         out.append((motion, label, f"{values['all']:.2f}", _shown(values["hidden"], 2), *coverage_cells))
     return out
 
