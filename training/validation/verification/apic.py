@@ -1,7 +1,7 @@
 """APIC, the usual material point scheme, for comparison: all forces pass through the grid (Jiang, Gast, Teran 2017).
 
 Vertices and triangles are particles; a quarter of a triangle's mass goes to each corner and to itself. The transfer
-filters velocities at every substep, so its damping depends on dt: docs/verification.md shows both schemes side by side.
+filters velocities at every substep, so its damping depends on dt. docs/validation/verification.md shows both schemes.
 """
 
 from __future__ import annotations
@@ -15,17 +15,24 @@ from torch import Tensor
 
 import torchcloth as tc
 from torchcloth.boundaries import AbstractBoundary, PrescribedMotion
-from torchcloth.dynamics.contact import Grid, carried_momentum, lattice, stencil, through
-from torchcloth.dynamics.contact.self_contact import Layers, add_columns, near_layers, per_point, pressure
-from torchcloth.dynamics.elasticity import evolve, membrane_stress
-from torchcloth.dynamics.forces import Impulses, constrain, vertex_forces
-from torchcloth.dynamics.model import CustomSubstep, Model, centroids, surface
+from torchcloth.dynamics.contact import Grid, affine_momentum, place_on_grid, stencil_nodes, sum_on_nodes
+from torchcloth.dynamics.contact.self_contact import (
+    ContactCandidates,
+    add_director_stress,
+    coefficients_per_point,
+    compute_director_forces,
+    find_contact_candidates,
+)
+from torchcloth.dynamics.elasticity import membrane_stress, update_memory
+from torchcloth.dynamics.forces import Impulses, apply_boundaries, vertex_forces
+from torchcloth.dynamics.kinematics import centroids, surface
+from torchcloth.dynamics.model import CustomSubstep, Model
 from torchcloth.effects import AbstractEffect
 from torchcloth.engine.dispatch import Setting
 from torchcloth.errors import InvalidInput
 from torchcloth.types import ClothState, Memory, Surface, Trajectory
 
-MEMORY = "apic"  # name of the affine velocities in ClothState.memory
+MEMORY_NAME = "apic"  # name of the affine velocities in ClothState.memory
 
 
 class APICCloth(tc.Cloth):
@@ -59,12 +66,12 @@ class APICCloth(tc.Cloth):
     ) -> None:
         if contact is None:
             raise InvalidInput("contact", got="None", expected="a Contact: APIC needs its grid")
-        contact = replace(contact, subdivisions=1, everywhere=True, play=0.0, damping=0.0)
+        contact = replace(contact, subdivisions=1, everywhere=True, free_compression=0.0, damping=0.0)
         super().__init__(mesh, material, areal_density, effects, boundaries, contact, engine)
 
-    def model(self) -> Model:
+    def build_model(self) -> Model:
         """Return the model of ``Cloth``, with APIC as its substep."""
-        return super().model()._replace(custom_substep=APIC)
+        return super().build_model()._replace(custom_substep=APIC)
 
     def settle(
         self,
@@ -77,7 +84,7 @@ class APICCloth(tc.Cloth):
     ) -> ClothState:
         """Let the cloth come to rest as ``Cloth.settle`` does, and stop the particles' affine velocities, too."""
         settled = super().settle(state, motion, start=start, duration=duration, rate=rate)
-        return settled._replace(memory={**settled.memory, MEMORY: torch.zeros_like(settled.memory[MEMORY])})
+        return settled._replace(memory={**settled.memory, MEMORY_NAME: torch.zeros_like(settled.memory[MEMORY_NAME])})
 
 
 def step(
@@ -86,7 +93,7 @@ def step(
     dt: float,
     drives: Mapping[str, PrescribedMotion],
     substep: int,
-    layers: Layers | None = None,
+    layers: ContactCandidates | None = None,
     lost: Tensor | None = None,
 ) -> tuple[ClothState, Impulses]:
     """Advance the cloth by one substep: a ``CustomSubstep``.
@@ -95,10 +102,10 @@ def step(
     """
     grid = cast("Grid", model.grid)  # APICCloth refuses to be made without
     s = surface(model.geometry, state.x, state.v, lost)
-    memory = evolve(model, state, s, dt, lost)
-    layers = near_layers(model, grid, state.x) if layers is None else layers
-    press = pressure(model, grid, layers, state, s, dt)
-    columns = add_columns(layers, membrane_stress(model, s, memory), press)
+    memory = update_memory(model, state, s, dt, lost)
+    layers = find_contact_candidates(model, grid, state.x) if layers is None else layers
+    press = compute_director_forces(model, grid, layers, state, s, dt)
+    columns = add_director_stress(layers, membrane_stress(model, s, memory), press)
     nothing = (torch.zeros_like(columns[0]), torch.zeros_like(columns[1]))
     # Weight, air: triangles get their share of it as well. Of air that moves along, nothing.
     light = {name: (effect, c) for name, (effect, c) in model.effects.items() if effect.inertia(c, s) is None}
@@ -114,28 +121,28 @@ def step(
     mass = _masses(model, state, s).reshape(-1, 1)
     each = position.shape[0] // max(1, batch.numel())
     scene = torch.arange(batch.numel(), device=position.device).repeat_interleave(each)
-    nodes = stencil(position, mass, scene, grid, layers.slots)
+    nodes = place_on_grid(position, mass, scene, grid, layers.slots)
 
-    affine = memory[MEMORY].reshape(-1, 3, 3)
-    momentum = carried_momentum(nodes, mass, velocity, affine, grid.spacing)
-    slope = nodes.slope.unflatten(0, (-1, each))[:, vertices:].flatten(0, 1)
+    affine = memory[MEMORY_NAME].reshape(-1, 3, 3)
+    momentum = affine_momentum(nodes, mass, velocity, affine, grid.spacing)
+    slope = nodes.weight_gradient.unflatten(0, (-1, each))[:, vertices:].flatten(0, 1)
     director = -(slope @ press.d3.unsqueeze(-1)) * press.pull.unsqueeze(-2)
     weight = nodes.weight.unflatten(0, (-1, each))[:, :vertices].flatten(0, 1)
     mesh = weight.unsqueeze(-1) * force.reshape(-1, 1, 3)
     both = torch.cat([part.unflatten(0, (batch.numel(), -1)) for part in (mesh, director)], dim=1).flatten(0, 1)
-    seen = through(nodes.node, momentum + dt * both) * nodes.inverse.unsqueeze(-1)
+    seen = sum_on_nodes(nodes.node, momentum + dt * both) * nodes.inverse_mass.unsqueeze(-1)
 
-    arm = (lattice(position) - nodes.offset.unsqueeze(-2)) * grid.spacing
+    arm = (stencil_nodes(position) - nodes.offset.unsqueeze(-2)) * grid.spacing
     weighted = nodes.weight.unsqueeze(-1) * seen
-    memory[MEMORY] = (4 / grid.spacing**2 * weighted.mT @ arm).view(*batch, each, 9)
+    memory[MEMORY_NAME] = (4 / grid.spacing**2 * weighted.mT @ arm).view(*batch, each, 9)
     free = weighted.sum(-2).view(*batch, each, 3)[..., :vertices, :]
-    v, impulses = constrain(model, state.x, free, dt, drives, substep, None)
+    v, impulses = apply_boundaries(model, state.x, free, dt, drives, substep, None)
     x = state.x + dt * v
 
-    gradient = (seen.mT @ nodes.slope).unflatten(0, (-1, each))[:, vertices:].flatten(0, 1)
+    gradient = (seen.mT @ nodes.weight_gradient).unflatten(0, (-1, each))[:, vertices:].flatten(0, 1)
     moved = press.d3 + dt * (gradient @ press.d3.unsqueeze(-1)).squeeze(-1)
     n = surface(model.geometry, x, v).n.reshape(-1, 1, 3)
-    mapped = model.material.return_map(per_point(model, layers, s), n, moved.unsqueeze(-2))
+    mapped = model.material.return_map(coefficients_per_point(model, layers, s), n, moved.unsqueeze(-2))
     return ClothState(x, v, mapped.view(state.d3.shape), memory), impulses
 
 
@@ -149,7 +156,7 @@ def _masses(model: Model, state: ClothState, s: Surface) -> Tensor:
 
 def initial_memory(x: Tensor, triangles: int) -> Memory:
     """Return affine velocities of zero for vertices at x [..., V, 3] m and so many triangles."""
-    return {MEMORY: x.new_zeros(*x.shape[:-2], x.shape[-2] + triangles, 9)}
+    return {MEMORY_NAME: x.new_zeros(*x.shape[:-2], x.shape[-2] + triangles, 9)}
 
 
 APIC = CustomSubstep("apic", step, initial_memory)

@@ -1,8 +1,7 @@
-"""Pictures of the cases: the same bytes from the same data."""
+"""Pictures of the cases. The same data give the same bytes."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -10,18 +9,17 @@ import numpy as np
 
 from .registry import Case, Outcome
 
-Data = Mapping[str, np.ndarray]
-TRUTH, MEASURED, OTHER = "#888888", "#1f6f8b", "#b0653a"
-CYCLE = (MEASURED, OTHER, "#4c9a5b", "#8566a8", "#c2a23a", "#c95f8a", "#555555")
+TRUTH_COLOUR, MEASURED_COLOUR, SECOND_COLOUR = "#888888", "#1f6f8b", "#b0653a"
+COLOUR_CYCLE = (MEASURED_COLOUR, SECOND_COLOUR, "#4c9a5b", "#8566a8", "#c2a23a", "#c95f8a", "#555555")
 
 
-def colour(k: int) -> str:
-    """Of the k-th line."""
-    return CYCLE[k % len(CYCLE)]
+def line_colour(k: int) -> str:
+    """Return the colour of the k-th line."""
+    return COLOUR_CYCLE[k % len(COLOUR_CYCLE)]
 
 
-def draw(case: Case, outcome: Outcome, folder: Path) -> bool:
-    """Write ``folder``/verification/NAME.png; False where the case has no picture."""
+def draw_case(case: Case, outcome: Outcome, folder: Path) -> bool:
+    """Write ``folder``/verification/NAME.png; return False where the case has no picture."""
     if case.draw is None or not outcome.data:
         return False
     from matplotlib import rc_context
@@ -36,17 +34,19 @@ def draw(case: Case, outcome: Outcome, folder: Path) -> bool:
     return True
 
 
-def against(axis: Any, x: np.ndarray, measured: np.ndarray, truth: np.ndarray, labels: tuple[str, str]) -> None:
-    """Truth as a line, measured as dots over it."""
-    axis.plot(x, truth, color=TRUTH, lw=2.5, label="truth")
-    axis.plot(x, measured, ".", color=MEASURED, ms=5, label="measured")
+def plot_against_truth(
+    axis: Any, x: np.ndarray, measured: np.ndarray, truth: np.ndarray, labels: tuple[str, str]
+) -> None:
+    """Plot the truth as a line, and measured values as dots over it."""
+    axis.plot(x, truth, color=TRUTH_COLOUR, lw=2.5, label="truth")
+    axis.plot(x, measured, ".", color=MEASURED_COLOUR, ms=5, label="measured")
     axis.set(xlabel=labels[0], ylabel=labels[1])
     axis.legend()
 
 
-def sheet(axis: Any, x: np.ndarray, faces: np.ndarray, title: str) -> None:
-    """A mesh in a three-dimensional axis, with equal scales."""
-    axis.plot_trisurf(*x.T, triangles=faces, color=MEASURED, edgecolor="#ffffff", linewidth=0.15, alpha=0.85)
+def plot_mesh(axis: Any, x: np.ndarray, faces: np.ndarray, title: str) -> None:
+    """Plot a mesh in a three-dimensional axis with equal scales."""
+    axis.plot_trisurf(*x.T, triangles=faces, color=MEASURED_COLOUR, edgecolor="#ffffff", linewidth=0.15, alpha=0.85)
     middle, half = (x.max(0) + x.min(0)) / 2, max(np.ptp(x, axis=0).max() / 2, 1e-3)
     axis.set(xlim=middle[0] + [-half, half], ylim=middle[1] + [-half, half], zlim=middle[2] + [-half, half])
     axis.set_title(title, fontsize=8)

@@ -1,4 +1,4 @@
-"""Finished cases on disk, so that a stopped run resumes."""
+"""Outcomes of finished cases on disk, so that a stopped run can resume."""
 
 from __future__ import annotations
 
@@ -14,39 +14,49 @@ from pathlib import Path
 
 import numpy as np
 
-from .registry import Case, Mark, Outcome, Row
+import torchcloth
 
-HERE = Path(__file__).parent
-LIBRARY = HERE.parents[2] / "torchcloth"
-SHARED = ("registry.py", "scenes.py", "closed_forms.py")
+from .registry import Case, Outcome, Row, Tolerance
+
+VERIFICATION_FOLDER = Path(__file__).parent
+LIBRARY_FOLDER = Path(torchcloth.__file__).parent
+SHARED_SOURCES = ("registry.py", "scenes.py", "closed_forms.py")
 
 
-class Results:
-    """Outcomes by case; a finished one is valid while the case's sources and the library are as they were."""
+class ResultStore:
+    """Outcomes by case. A stored one is valid while the sources of the case and of the library are unchanged.
+
+    Args:
+        folder: of the results.
+        fast: store outcomes of the coarse versions.
+        resume: use stored outcomes even if the library has changed.
+        fresh: use no stored outcome.
+    """
 
     def __init__(self, folder: Path, fast: bool, resume: bool, fresh: bool) -> None:
         self.folder, self.fast, self.resume, self.fresh = folder, fast, resume, fresh
         self.store = folder / ("fast" if fast else "full")
         self.store.mkdir(parents=True, exist_ok=True)
-        self._library = _digest(sorted(LIBRARY.rglob("*.py")))
+        self._library_digest = _digest(sorted(LIBRARY_FOLDER.rglob("*.py")))
 
-    def get(self, case: Case) -> tuple[Outcome, bool]:
-        """(outcome, whether it was found finished)."""
+    def get_or_run(self, case: Case) -> tuple[Outcome, bool]:
+        """Return the outcome of a case, and whether it was stored."""
         file = self.store / f"{case.name}.npz"
-        own = self._key(case)
-        if not self.fresh and file.is_file():
-            found = _read(file)
-            if found and found[0]["case"] == own and (self.resume or found[0]["library"] == self._library):
-                return found[1], True
+        case_digest = self._case_digest(case)
+        stored = None if self.fresh or not file.is_file() else _read(file)
+        if stored is not None:
+            digests, outcome = stored
+            if digests["case"] == case_digest and (self.resume or digests["library"] == self._library_digest):
+                return outcome, True
         outcome = case.function(self.fast)
-        _write(file, {"case": own, "library": self._library}, outcome)
+        _write(file, {"case": case_digest, "library": self._library_digest}, outcome)
         return outcome, False
 
-    def _key(self, case: Case) -> str:
-        """Of what the case computes with: its module without the other cases, and what all share."""
-        own = inspect.getsourcefile(case.function)
-        total = hashlib.sha256(_digest([HERE / name for name in SHARED]).encode())
-        for node in ast.parse(Path(own).read_text(encoding="utf-8")).body if own else ():
+    def _case_digest(self, case: Case) -> str:
+        """Return a digest of the case's module without the other cases, and of the shared modules."""
+        source = inspect.getsourcefile(case.function)
+        total = hashlib.sha256(_digest([VERIFICATION_FOLDER / name for name in SHARED_SOURCES]).encode())
+        for node in ast.parse(Path(source).read_text(encoding="utf-8")).body if source else ():
             if not _is_case(node) or getattr(node, "name", "") == case.function.__name__:
                 total.update(ast.dump(node).encode())
         return total.hexdigest()[:16]
@@ -54,7 +64,7 @@ class Results:
 
 def _is_case(node: ast.stmt) -> bool:
     calls = [d.func for d in getattr(node, "decorator_list", ()) if isinstance(d, ast.Call)]
-    return any(getattr(call, "id", None) == "case" for call in calls)
+    return any(getattr(call, "id", None) == "register_case" for call in calls)
 
 
 def _digest(files: list[Path]) -> str:
@@ -65,12 +75,12 @@ def _digest(files: list[Path]) -> str:
     return total.hexdigest()[:16]
 
 
-def _write(file: Path, keys: dict[str, str], outcome: Outcome) -> None:
-    head = {"keys": keys, "rows": [asdict(row) for row in outcome.rows], "note": outcome.note}
-    part = io.BytesIO()
-    np.savez_compressed(part, __head__=np.array(json.dumps(head)), **outcome.data)  # type: ignore[arg-type]
+def _write(file: Path, digests: dict[str, str], outcome: Outcome) -> None:
+    head = {"digests": digests, "rows": [asdict(row) for row in outcome.rows], "note": outcome.note}
+    buffer = io.BytesIO()
+    np.savez_compressed(buffer, __head__=np.array(json.dumps(head)), **outcome.data)  # type: ignore[arg-type]
     temporary = file.with_suffix(".part")
-    temporary.write_bytes(part.getvalue())
+    temporary.write_bytes(buffer.getvalue())
     os.replace(temporary, file)
 
 
@@ -79,7 +89,10 @@ def _read(file: Path) -> tuple[dict[str, str], Outcome] | None:
         with np.load(file) as stored:
             head = json.loads(str(stored["__head__"]))
             data = {name: stored[name] for name in stored.files if name != "__head__"}
-        rows = [Row(**{**row, "mark": Mark(**row["mark"]) if row["mark"] else None}) for row in head["rows"]]
-        return head["keys"], Outcome(rows, data, head["note"])
+        rows = [
+            Row(**{**row, "tolerance": Tolerance(**row["tolerance"]) if row["tolerance"] else None})
+            for row in head["rows"]
+        ]
+        return head["digests"], Outcome(rows, data, head["note"])
     except (OSError, ValueError, KeyError, TypeError, zipfile.BadZipFile):
         return None  # half a file, or one of an older layout: measure again

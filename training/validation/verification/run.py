@@ -1,6 +1,6 @@
 """``make verify``: run every case, print one table, write the page.
 
-Exit code 1 when a mark is missed, 2 on bad usage.
+The exit code is 1 when a tolerance is missed, 2 on bad usage.
 """
 
 from __future__ import annotations
@@ -14,15 +14,20 @@ from pathlib import Path
 
 import torch
 
-from .assessment import OPEN, Line, lines, unfinished
-from .registry import CASES, Case, NotThere
-from .result_store import Results
+from .assessment import UNMET_VERDICTS, TableLine, assess_outcome, failed_line
+from .registry import CASES, Case
+from .result_store import ResultStore
 
-ROOT = Path(__file__).resolve().parents[3]
+REPOSITORY = Path(__file__).resolve().parents[3]
 
 
 def main(argv: Sequence[str] | None = None, cases: Mapping[str, Case] | None = None) -> int:
-    """Run the cases that ``argv`` names (``cases`` replaces the registered ones); returns the exit code."""
+    """Run the cases that ``argv`` names, and return the exit code.
+
+    Args:
+        argv: of the command line; None: the process's.
+        cases: replace the registered ones.
+    """
     if cases is None:
         from . import all_cases  # noqa: F401 - registers the cases
 
@@ -37,11 +42,11 @@ def main(argv: Sequence[str] | None = None, cases: Mapping[str, Case] | None = N
     chosen = [c for c in cases.values() if c.name in options.only] if options.only else list(cases.values())
     if options.fast:
         chosen = [c for c in chosen if c.fast]
-    table = _run(chosen, Results(options.out, options.fast, options.resume, options.fresh))
+    lines = _run(chosen, ResultStore(options.out, options.fast, options.resume, options.fresh))
     if not options.only and not options.fast:
         _publish(options.out, options.docs)
-    missed = sorted({line.case for line in table if line.verdict in OPEN})
-    print(f"missed: {', '.join(missed)}" if missed else f"all {len(chosen)} cases meet their marks")
+    missed = sorted({line.case for line in lines if line.verdict in UNMET_VERDICTS})
+    print(f"missed: {', '.join(missed)}" if missed else f"all {len(chosen)} cases meet their tolerances")
     return 1 if missed else 0
 
 
@@ -50,14 +55,16 @@ def _parse(argv: Sequence[str] | None, cases: Mapping[str, Case]) -> argparse.Na
     parser.add_argument("--only", nargs="+", metavar="NAME", default=[], help="these cases (--list names them)")
     parser.add_argument("--list", action="store_true", help="name the cases and stop")
     parser.add_argument("--fast", action="store_true", help="coarser, and without the long cases")
-    parser.add_argument("--out", type=Path, default=ROOT / "out/verification", help="results, pictures and page")
-    parser.add_argument("--docs", type=Path, default=ROOT / "docs/validation", help="where a complete run puts the page")
+    parser.add_argument("--out", type=Path, default=REPOSITORY / "out/verification", help="results, pictures and page")
+    parser.add_argument(
+        "--docs", type=Path, default=REPOSITORY / "docs/validation", help="folder for the page of a complete run"
+    )
     again = parser.add_mutually_exclusive_group()
-    again.add_argument("--fresh", action="store_true", help="use no finished case of an earlier run")
+    again.add_argument("--fresh", action="store_true", help="use no stored outcome")
     again.add_argument(
         "--resume",
         action="store_true",
-        help="use finished cases even if the library changed since (they must be yours)",
+        help="use stored outcomes of your own even if the library has changed since",
     )
     options = parser.parse_args(argv)
     unknown = [name for name in options.only if name not in cases]
@@ -66,33 +73,32 @@ def _parse(argv: Sequence[str] | None, cases: Mapping[str, Case]) -> argparse.Na
     return options
 
 
-def _run(chosen: Sequence[Case], results: Results) -> list[Line]:
-    """Run what is not finished yet; table, pictures and page go out even when some case fails."""
+def _run(chosen: Sequence[Case], store: ResultStore) -> list[TableLine]:
+    """Run what is not stored yet; table, pictures and page are written even if a case fails."""
     from . import console_table, report_page
-    from .case_figures import draw
+    from .case_figures import draw_case
 
-    found: list[tuple[Case, str, list[Line], bool]] = []
-    with console_table.progress(len(chosen)) as report:
+    reports: list[report_page.CaseReport] = []
+    with console_table.show_progress(len(chosen)) as progress:
         for case in chosen:
-            report.begin(case.name)
-            start, note, picture = time.process_time(), "", False
+            progress.start_case(case.name)
+            start, note, has_picture, was_stored = time.process_time(), "", False, False
             try:
-                outcome, reused = results.get(case)
-                rows, note = lines(case, outcome), outcome.note
-                picture = draw(case, outcome, results.folder)
-            except NotThere as error:
-                rows, reused = unfinished(case, "absent", str(error)), False
+                outcome, was_stored = store.get_or_run(case)
+                lines, note = assess_outcome(case, outcome), outcome.note
+                has_picture = draw_case(case, outcome, store.folder)
             except Exception as error:  # a case that breaks must not hide the others
-                rows, reused = unfinished(case, "failed", f"{type(error).__name__}: {error}".splitlines()[0]), False
-            found.append((case, note, rows, picture))
-            report.end(case.name, rows, None if reused else time.process_time() - start)
-    console_table.show([line for _, _, rows, _ in found for line in rows])
-    report_page.write(found, results.folder)
-    return [line for _, _, rows, _ in found for line in rows]
+                lines = failed_line(case, f"{type(error).__name__}: {error}".splitlines()[0])
+            reports.append(report_page.CaseReport(case, note, lines, has_picture))
+            progress.finish_case(case.name, lines, None if was_stored else time.process_time() - start)
+    all_lines = [line for report in reports for line in report.lines]
+    console_table.print_table(all_lines)
+    report_page.write_page(reports, store.folder)
+    return all_lines
 
 
 def _publish(out: Path, docs: Path) -> None:
-    """Copy the page and its pictures; pictures of cases that are no more go away."""
+    """Copy the page and its pictures, and delete pictures of former cases."""
     pictures = docs / "verification"
     shutil.rmtree(pictures, ignore_errors=True)
     pictures.mkdir(parents=True)
