@@ -1,6 +1,5 @@
 """Shared fixtures: float64, and one base model."""
 
-
 import pytest
 import torch
 
@@ -18,10 +17,10 @@ def made():
     """The base model of ``sheets.episode()``, and its setting."""
     from helpers import sheet_episodes
 
-    from torchcloth.diagnosis import base_model, prepare_data
+    from torchcloth.diagnosis import build_base_model, prepare_data
 
     before, recording = torch.get_default_dtype(), sheet_episodes.episode()
     torch.set_default_dtype(torch.float64)
-    model = base_model(recording)
+    model = build_base_model(recording)
     yield model, prepare_data(model, [recording])
     torch.set_default_dtype(before)

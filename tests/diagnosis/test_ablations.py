@@ -6,10 +6,10 @@ import torch
 from helpers import linear_evidence as toys
 from helpers import sheet_episodes
 
-from torchcloth.diagnosis.causes.hypotheses import catalogue
+from torchcloth.diagnosis.causes.hypotheses import list_hypotheses
 from torchcloth.diagnosis.data.dataset import prepare_data
 from torchcloth.diagnosis.inference.screening import screen
-from torchcloth.diagnosis.models.base_model import base_model
+from torchcloth.diagnosis.models.base_model import build_base_model
 
 NAMES = ["a", "b", "c"]
 SLOPES = toys.smooth(1, 6)  # two parameters, three hypotheses, one nuisance
@@ -70,7 +70,7 @@ def test_tested_against_zero_what_does_not_matter_would_be_a_cause():
     for seed in SEEDS:
         found = toys.fitted(made((0.0, 0.2, 0.0), seed))
         right += present(found)
-        anything = [replace(h, share=0.0) for h in found.linearisation.hypotheses]
+        anything = [replace(h, smallest_fraction=0.0) for h in found.linearisation.hypotheses]
         wrong += present(replace(found, evidence=replace(found.linearisation, hypotheses=anything)))
     assert right == 0
     assert wrong > 30
@@ -88,10 +88,10 @@ def test_a_tangent_would_not_see_what_begins_slowly(monkeypatch):
     """Wind pushes by its square: at a hundredth of a typical one cloth that hangs still feels nothing."""
     monkeypatch.setitem(sheet_episodes.MOTIONS, "still", sheet_episodes.swing(0.0, 1.0))
     recording = sheet_episodes.episode("still", duration=0.5)
-    model = base_model(recording)
+    model = build_base_model(recording)
     setting = prepare_data(model, [recording])
-    (wind,) = (h for h in catalogue(model, [recording]) if h.name == "air.wind[y]")
-    moved = lambda a: model.world([(wind, a * wind.typical)]).frames(setting.episodes[0]).x  # noqa: E731
+    (wind,) = (h for h in list_hypotheses(model, [recording]) if h.name == "air.wind[y]")
+    moved = lambda a: model.build_world([(wind, a * wind.typical)]).simulate_observed(setting.episodes[0]).x  # noqa: E731
     still = moved(1e-6)  # any wind brings its drag along
     tangent, secant = (moved(0.01) - still) / 0.01, moved(1.0) - still
     assert float(secant.norm()) > 10 * float(tangent.norm())

@@ -9,23 +9,27 @@ import torch
 from helpers import linear_evidence as toys
 from scipy.stats import t
 
+from torchcloth._utils.constants import Z_95
 from torchcloth.diagnosis.decide.candidates import (
-    NORMAL,
-    SURE,
-    SURE_OF_BEST,
-    TRIED,
     Candidate,
     _agreed,
-    _bent,
-    _disturbed,
-    _ranked,
+    _find_worsened_motions,
+    _measure_prior_shift,
+    _rank,
+    choose_t_threshold,
     known,
-    standard_errors,
 )
-from torchcloth.diagnosis.decide.verdict import _disagreed, _error, _parameters
-from torchcloth.diagnosis.inference.comparison import Gain, list_observed_motions, predict_held_out, jackknife, count_effective_motions
+from torchcloth.diagnosis.decide.criteria import CRITERIA
+from torchcloth.diagnosis.decide.verdict import _amplitude_errors, _describe_parameters, _do_motions_disagree
+from torchcloth.diagnosis.inference.comparison import (
+    Gain,
+    count_effective_motions,
+    jackknife,
+    list_observed_motions,
+    predict_held_out,
+)
 from torchcloth.diagnosis.inference.screening import ScoreTest
-from torchcloth.episodes.world import Model
+from torchcloth.episodes.world import WorldModel
 
 
 def gain(after):
@@ -35,7 +39,7 @@ def gain(after):
 @pytest.mark.parametrize(
     ("after", "names", "first", "asked"),
     [
-        (0.7, ["a", "b", "c"], True, NORMAL),  # half of the mean square
+        (0.7, ["a", "b", "c"], True, Z_95),  # half of the mean square
         (0.9, ["a", "b", "c"], True, 4.30),  # a fifth
         (0.7, ["a", "b", "c"], False, 8.86),  # beside another cause, the best of four
         (0.7, ["a", "b", "b"], True, 12.71),  # two motions
@@ -43,11 +47,11 @@ def gain(after):
     ],
 )
 def test_what_mends_much_of_all_that_is_wrong_may_differ_from_motion_to_motion(after, names, first, asked):
-    assert standard_errors(gain(after), names, set(), first) == pytest.approx(asked, abs=0.01)
+    assert choose_t_threshold(gain(after), names, set(), first) == pytest.approx(asked, abs=0.01)
 
 
 def test_a_motion_that_alone_tells_counts_twice_and_does_not_make_three():
-    assert standard_errors(gain(0.7), ["a", "b"], {"a"}, True) == pytest.approx(4.30, abs=0.01)
+    assert choose_t_threshold(gain(0.7), ["a", "b"], {"a"}, True) == pytest.approx(4.30, abs=0.01)
 
 
 def test_motions_without_cells_neither_count_nor_are_left_out():
@@ -55,7 +59,9 @@ def test_motions_without_cells_neither_count_nor_are_left_out():
     slopes = toys.smooth(2, 3)
     ev = toys.evidence(slopes, 2, [], torch.tensor([0.3, -0.2]).double(), 0)
     silent = replace(
-        ev, cells=[*ev.bins[:3], ev.bins[3].select(slice(0))], numerics=[*ev.mesh_differences[:3], ev.mesh_differences[3][:0]]
+        ev,
+        cells=[*ev.bins[:3], ev.bins[3].select(slice(0))],
+        numerics=[*ev.mesh_differences[:3], ev.mesh_differences[3][:0]],
     )
     three = replace(ev, cells=ev.bins[:3], stds=ev.nuisance_stds[:3], numerics=ev.mesh_differences[:3])
     mean, std = jackknife(toys.fitted(silent), ["a", "b", "c", "d"])
@@ -65,13 +71,15 @@ def test_motions_without_cells_neither_count_nor_are_left_out():
 
 
 def test_one_motion_agrees_with_nothing():
-    assert standard_errors(gain(0.7), ["a"], set(), True) == float("inf")
+    assert choose_t_threshold(gain(0.7), ["a"], set(), True) == float("inf")
 
 
 def test_the_numbers_are_those_of_students_distribution():
-    for k, (sure, of_best) in enumerate(zip(SURE, SURE_OF_BEST, strict=True), 1):
+    for k, (sure, of_best) in enumerate(
+        zip(CRITERIA.candidate.t_quantiles, CRITERIA.candidate.t_quantiles_best_of_four, strict=True), 1
+    ):
         assert sure == pytest.approx(t.ppf(0.975, k), abs=0.006)
-        assert of_best == pytest.approx(t.ppf(1 - 0.025 / TRIED, k), abs=0.006)
+        assert of_best == pytest.approx(t.ppf(1 - 0.025 / CRITERIA.candidate.max_tried, k), abs=0.006)
 
 
 def test_of_those_that_predict_alike_the_one_that_mends_most_comes_first():
@@ -79,8 +87,8 @@ def test_of_those_that_predict_alike_the_one_that_mends_most_comes_first():
         Candidate(None, None, None, gain(after)._replace(density=density), set(), 2.57)  # type: ignore[arg-type]
         for after, density in ((0.5, 100.0), (0.3, 97.0), (0.1, 95.0), (0.4, 98.0))
     ]
-    assert [c.gain.log_density for c in _ranked(tried)] == [97.0, 98.0, 100.0, 95.0]
-    assert _ranked([]) == []
+    assert [c.gain.log_density for c in _rank(tried)] == [97.0, 98.0, 100.0, 95.0]
+    assert _rank([]) == []
 
 
 @pytest.mark.parametrize(("asked", "agreed"), [(0.1, True), (-0.5, False)])
@@ -105,7 +113,7 @@ def test_less_is_asked_of_a_rival_than_of_a_cause():
         cells[k] = c._replace(value=c.value - (0.03, -0.03, 0.02, -0.02)[k] * c.jacobian[:, 1])
     tried = replace(tried, fitted=toys.fitted(tried.fit.linearisation), sure=1e3)
     model = replace(tried.fit.model, accepted=(tried.hypothesis,), amplitudes=(0.3,))
-    model = replace(model, parameters=model.parameters[:1], values=torch.zeros(1).double())
+    model = replace(model, parameters=model.parameters[:1], coordinates=torch.zeros(1).double())
     tried = replace(tried, fitted=replace(tried.fit, model=model))
     assert not known(tried.fit, "cause", list("abcd"), tried)
     assert _agreed(tried, list("abcd"))
@@ -153,10 +161,10 @@ def test_a_motion_that_is_predicted_worse_is_found_where_it_is_not_the_one_that_
     first = predict_held_out(toys.fitted(ev), list("abcd"))
     larger = torch.ones(4).double().index_fill(0, torch.tensor([1]), 1.5)[first.episode]
     second = first._replace(value=larger * first.residual, white=larger * first.whitened)
-    (worse,) = _disturbed(first, second, list("abcd"), {"a"})
+    (worse,) = _find_worsened_motions(first, second, list("abcd"), {"a"})
     assert worse.rms_after == pytest.approx(1.5 * worse.rms_before)
     assert worse.log_density < 0
-    assert _disturbed(first, second, list("abcd"), {"b"}) == []
+    assert _find_worsened_motions(first, second, list("abcd"), {"b"}) == []
 
 
 def test_motions_need_not_agree_about_a_number_that_nothing_else_has_bent_so_far():
@@ -172,10 +180,10 @@ def test_motions_need_not_agree_about_a_number_that_nothing_else_has_bent_so_far
 
 
 def test_how_far_a_twin_has_left_its_sheet_is_in_standard_deviations_of_its_prior():
-    model = Model(None, (toys.parameter("p", 0.5), toys.parameter("q", 2.0)), torch.tensor([-3.0, 5.0]))  # type: ignore[arg-type]
-    assert _bent(model, "p") == 6.0
-    assert _bent(model, "q") == 2.5
-    assert _bent(model, "") == 0.0
+    model = WorldModel(None, (toys.parameter("p", 0.5), toys.parameter("q", 2.0)), torch.tensor([-3.0, 5.0]))  # type: ignore[arg-type]
+    assert _measure_prior_shift(model, "p") == 6.0
+    assert _measure_prior_shift(model, "q") == 2.5
+    assert _measure_prior_shift(model, "") == 0.0
 
 
 def test_as_many_tell_as_would_say_as_much():
@@ -184,7 +192,9 @@ def test_as_many_tell_as_would_say_as_much():
     one = all_alike.clone()
     one[1:, :, 1] = 0.0
     told = [
-        count_effective_motions(toys.fitted(toys.evidence(own, 2, [], torch.zeros(2).double(), 0)), 1, list("abcd"), halved)
+        count_effective_motions(
+            toys.fitted(toys.evidence(own, 2, [], torch.zeros(2).double(), 0)), 1, list("abcd"), halved
+        )
         for own, halved in ((all_alike, ()), (one, ()), (one, {"a"}))
     ]
     assert told[0] == pytest.approx(4.0, abs=1e-6)
@@ -197,7 +207,7 @@ def candidate(asked, numerics):
     ev = toys.evidence(toys.smooth(1, 3), 2, [], torch.tensor([0.0, asked]).double(), 0)
     there = toys.fitted(ev)
     cause = replace(toys.hypothesis("cause"), signed=False)
-    model = Model(None, there.model.parameters[:1], torch.zeros(1).double(), (cause,), (0.3,))  # type: ignore[arg-type]
+    model = WorldModel(None, there.model.parameters[:1], torch.zeros(1).double(), (cause,), (0.3,))  # type: ignore[arg-type]
     row = ScoreTest(cause, asked, 0.01, numerics, 0.0, 0.0, 0.0, asked, 0.0, "present")
     return Candidate(row, replace(there, model=model), None, None, set(), 2.57)  # type: ignore[arg-type]
 
@@ -210,10 +220,10 @@ def test_a_numbers_interval_knows_of_what_motions_disagree_by():
     found = toys.fitted(replace(ev, cells=cells))
     width = {
         name: (row["ci95"][1] - row["ci95"][0]) / 3.92
-        for name, row in _parameters(SimpleNamespace(end=found), list("abcd")).items()  # type: ignore[arg-type]
+        for name, row in _describe_parameters(SimpleNamespace(end=found), list("abcd")).items()  # type: ignore[arg-type]
     }
     noise, motions = found.covariance.diagonal().sqrt(), jackknife(found, list("abcd"))[1]
-    student, values = float(motions[1]) * 3.18 / 1.96, found.model.values.tolist()  # of four
+    student, values = float(motions[1]) * 3.18 / 1.96, found.model.coordinates.tolist()  # of four
     assert width["p1"] == pytest.approx(math.hypot(student, 0.03 * values[1]))
     assert width["p1"] > 3 * float(noise[1])
     assert all(width[f"p{k}"] >= float(noise[k]) - 1e-12 for k in range(2))
@@ -228,14 +238,14 @@ def test_motions_that_differ_by_more_than_noise_disagree(own, told, disagree):
     ev = toys.evidence(toys.smooth(1, 3), 2, [], torch.zeros(2).double(), 1)
     cells = [c._replace(value=c.value - a * c.jacobian[:, 1]) for c, a in zip(ev.bins, own, strict=True)]
     found = SimpleNamespace(end=toys.fitted(replace(ev, cells=cells)))
-    assert _disagreed(found, 1, told, list("abcd")) == disagree  # type: ignore[arg-type]
+    assert _do_motions_disagree(found, 1, told, list("abcd")) == disagree  # type: ignore[arg-type]
 
 
 def test_motions_of_one_value_disagree_as_often_as_chance_has_it():
     slopes, count = toys.smooth(1, 3), 300
     found = [toys.fitted(toys.evidence(slopes, 2, [], torch.zeros(2).double(), seed)) for seed in range(count)]
     told = count_effective_motions(found[0], 1, list("abcd"))
-    often = sum(_disagreed(SimpleNamespace(end=f), 1, told, list("abcd")) for f in found)  # type: ignore[arg-type]
+    often = sum(_do_motions_disagree(SimpleNamespace(end=f), 1, told, list("abcd")) for f in found)  # type: ignore[arg-type]
     assert often <= 0.02 * count
 
 
@@ -247,7 +257,7 @@ def test_an_error_is_the_noises_where_motions_agree_and_says_how_many_tell():
     found = toys.fitted(replace(ev, cells=cells))
     noise = found.covariance.diagonal().sqrt()
     for place, few in ((0, False), (1, True)):
-        own, both, told = _error(SimpleNamespace(end=found), place, list("abcd"), ())  # type: ignore[arg-type]
+        own, both, told = _amplitude_errors(SimpleNamespace(end=found), place, list("abcd"), ())  # type: ignore[arg-type]
         assert own == pytest.approx(float(noise[place]))
         assert both == pytest.approx(own, rel=0.3)
         assert (told < 2.2) == few

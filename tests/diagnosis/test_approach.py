@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from torchcloth.diagnosis.inference.warm_start import FARTHEST, _lowest, _parabola
+from torchcloth.diagnosis.inference.warm_start import FARTHEST, _fit_parabola, _minimise_parabola
 
 
 def quotients(curve, ahead, back):
@@ -20,7 +20,7 @@ def test_a_parabola_passes_through_both_sides_however_far_each_goes(ahead, back)
     a, b = (torch.tensor([step]).double() for step in (ahead, back))
     first, second = (torch.tensor(v).double()[:, None] for v in ([1.0, -2.0, 0.5], [0.3, 0.1, -0.2]))
     curve = lambda u: first * u + second * u * u  # noqa: E731
-    slope, bend = _parabola(*quotients(curve, a, b), a, b)
+    slope, bend = _fit_parabola(*quotients(curve, a, b), a, b)
     for end in (a, -b):
         torch.testing.assert_close(slope * end + bend * end**2, curve(end))
     assert torch.allclose(bend, second if ahead and back else 0 * second)
@@ -34,8 +34,8 @@ def test_the_lowest_place_lies_within_the_ends_and_the_others_make_up_for_it():
     value = -slope @ torch.tensor([-0.8, 0.1]).double()
     none, pull = torch.zeros(2).double(), torch.full((2,), 1e-3).double()
     far = torch.full((2,), FARTHEST).double()
-    free = _lowest(value, slope, 0 * slope, none, pull, (-far, far))
+    free = _minimise_parabola(value, slope, 0 * slope, none, pull, (-far, far))
     assert free.tolist() == pytest.approx([-0.8, 0.1], abs=1e-3)
-    held = _lowest(value, slope, 0 * slope, none, pull, (torch.tensor([0.0, -FARTHEST]).double(), far))
+    held = _minimise_parabola(value, slope, 0 * slope, none, pull, (torch.tensor([0.0, -FARTHEST]).double(), far))
     other = -float(slope[:, 1] @ value / (slope[:, 1] @ slope[:, 1]))
     assert held.tolist() == pytest.approx([0.0, other], abs=1e-3)

@@ -7,10 +7,11 @@ import torch
 from helpers import linear_evidence as toys
 
 from torchcloth.diagnosis.data.binning import time_blocks
+from torchcloth.diagnosis.decide.criteria import CRITERIA
 from torchcloth.diagnosis.inference.comparison import compare, predict_held_out
 from torchcloth.diagnosis.inference.fitting import gauss_newton_step
 from torchcloth.diagnosis.inference.noise import Noise, whiten
-from torchcloth.diagnosis.inference.robust_weights import FREEDOM, reweight, t_log_density, t_weights
+from torchcloth.diagnosis.inference.robust_weights import reweight, t_log_density, t_weights
 
 SLOPES = toys.smooth(1, 4)  # three parameters, one nuisance
 TRUTH = torch.tensor([0.2, -0.3, 0.7]).double()
@@ -22,13 +23,17 @@ def drawn(seed, flipped=0.0, truth=TRUTH):
     ev = toys.evidence(SLOPES, 3, [], truth, seed)
     first = ev.bins[0]
     away = flipped * ((first.window == 2) | (first.window == 3)).double()
-    return ev.__class__([first._replace(value=first.value + away), *ev.bins[1:]], 3, [], ev.nuisance_stds, ev.mesh_differences)
+    return ev.__class__(
+        [first._replace(value=first.value + away), *ev.bins[1:]], 3, [], ev.nuisance_stds, ev.mesh_differences
+    )
 
 
 def test_a_stretch_that_fits_counts_in_full_and_another_by_the_formula():
     stretch = torch.tensor([0, 0, 0, 0, 1, 1])
     value = torch.tensor([0.5, -0.5, 1.0, 0.1, 10.0, 20.0]).double()
-    assert t_weights(value, stretch).tolist() == pytest.approx([1.0] * 4 + [(FREEDOM + 2) / (FREEDOM + 500)] * 2)
+    assert t_weights(value, stretch).tolist() == pytest.approx(
+        [1.0] * 4 + [(CRITERIA.robust.t_dof + 2) / (CRITERIA.robust.t_dof + 500)] * 2
+    )
 
 
 def test_the_weights_are_the_slope_of_the_density():
@@ -62,7 +67,9 @@ def test_cloth_that_folds_over_for_a_while_moves_no_parameter():
 
 def test_where_all_fits_nothing_changes():
     ev = drawn(3, truth=torch.zeros(3).double())
-    quiet = ev.__class__([c._replace(value=0.5 * c.value) for c in ev.bins], 3, [], ev.nuisance_stds, ev.mesh_differences)
+    quiet = ev.__class__(
+        [c._replace(value=0.5 * c.value) for c in ev.bins], 3, [], ev.nuisance_stds, ev.mesh_differences
+    )
     assert torch.equal(reweight(whiten(quiet, LEVEL)).value, whiten(quiet, LEVEL).value)
 
 
@@ -71,9 +78,13 @@ def test_a_number_that_the_others_leave_open_is_no_failure_of_the_prediction():
     slopes = SLOPES.clone()
     slopes[1:, :, 2] = 0.0
     ev = toys.evidence(slopes, 3, [], torch.tensor([0.0, 0.0, 0.5]).double(), 0)
-    less = ev.__class__([c._replace(jacobian=c.jacobian[:, [0, 1, 3]]) for c in ev.bins], 2, [], ev.nuisance_stds, ev.mesh_differences)
+    less = ev.__class__(
+        [c._replace(jacobian=c.jacobian[:, [0, 1, 3]]) for c in ev.bins], 2, [], ev.nuisance_stds, ev.mesh_differences
+    )
     groups = ["a", "b", "c", "d"]
-    whole = compare(predict_held_out(toys.fitted(less), groups), predict_held_out(toys.fitted(ev, std=1.0), groups), 0.0)
+    whole = compare(
+        predict_held_out(toys.fitted(less), groups), predict_held_out(toys.fitted(ev, std=1.0), groups), 0.0
+    )
     assert whole.log_density > 10.0  # that it may be anything is far better than that it is zero
     assert whole.robust_rms[1] < whole.robust_rms[0]
 

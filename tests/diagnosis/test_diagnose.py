@@ -10,7 +10,16 @@ from helpers import sheet_episodes
 
 from torchcloth import recordings as rec
 from torchcloth.cli import main
-from torchcloth.diagnosis import base_model, catalogue, diagnose, load_model, run, search, prepare_data, write_diagnosis
+from torchcloth.diagnosis import (
+    build_base_model,
+    diagnose,
+    list_hypotheses,
+    load_model,
+    prepare_data,
+    run,
+    search,
+    write_diagnosis,
+)
 from torchcloth.diagnosis.decide.verdict import judge
 from torchcloth.diagnosis.experiment.proposal import Proposal
 from torchcloth.diagnosis.report.cloud_pictures import draw_cloud_overlays
@@ -25,7 +34,7 @@ def episodes(change, seed=0):
 
 
 def asked(recordings):
-    return [h for h in catalogue(base_model(recordings[0]), recordings) if h.name in ASKED]
+    return [h for h in list_hypotheses(build_base_model(recordings[0]), recordings) if h.name in ASKED]
 
 
 @pytest.fixture(scope="module")
@@ -45,7 +54,7 @@ def test_hidden_drag_is_named(with_drag):
     assert cause["amplitude"] == pytest.approx(1.5, rel=0.15)
     low, high = cause["noise_ci95"]
     assert cause["ci95"][0] <= low < cause["amplitude"] < high <= cause["ci95"][1]
-    assert 1.0 <= cause["told_by"] <= len(sheet_episodes.MOTIONS)
+    assert 1.0 <= cause["effective_motions"] <= len(sheet_episodes.MOTIONS)
     gain = answer.content["gain"]
     assert gain["rms_after"] < 0.5 * gain["rms_before"]
     assert gain["explained_fraction"] > 0.9
@@ -68,7 +77,7 @@ def test_a_cause_says_where_and_when_it_shows(with_drag):
     assert cause["where"]["at"][1] < 0.5 * sheet_episodes.SIDE
     assert cause["when"]["motion"] in sheet_episodes.MOTIONS
     assert 0.0 < cause["when"]["from"] < cause["when"]["to"] <= 0.2 + sheet_episodes.FRAMES / sheet_episodes.RATE
-    assert 1e-3 < cause["moves"]["value"] < 0.1
+    assert 1e-3 < cause["response"]["value"] < 0.1
 
 
 def test_the_cloud_is_shown_over_both_models_where_the_first_is_farthest_off(with_drag):
@@ -98,7 +107,7 @@ def test_an_amplitude_that_no_world_can_have_ends_a_fit_and_not_the_diagnosis(wi
             raise InvalidInput("brittle", got=amplitude, expected="no more than typical")
         return drag.apply(world, amplitude)
 
-    model = base_model(recordings[0])
+    model = build_base_model(recordings[0])
     found = search(model, prepare_data(model, recordings), [replace(drag, name="user.brittle", apply=brittle)])
     assert all(amplitude <= drag.typical for amplitude in found.end.model.amplitudes)
     assert refused
@@ -119,8 +128,8 @@ def test_rivals_that_no_motion_would_tell_apart_are_warned_of(with_drag, monkeyp
     content = found.content
     assert content["next_experiment"] == following
     assert found.experiment is (proposal and recordings[0])
-    assert (run.NONE_TELLS in content["warnings"]) is warned
-    assert run.NONE_TELLS not in answer.content["warnings"]
+    assert (run.NO_EXPERIMENT_WARNING in content["warnings"]) is warned
+    assert run.NO_EXPERIMENT_WARNING not in answer.content["warnings"]
 
 
 def test_the_answer_is_written_and_its_model_is_a_layer(with_drag, tmp_path):
@@ -136,7 +145,7 @@ def test_the_answer_is_written_and_its_model_is_a_layer(with_drag, tmp_path):
     assert "http" not in page  # self-contained
     assert "<th>matters from</th><th>shows from</th>" in page
     assert "(not zero)" in page
-    world = load_model(tmp_path / content["model"]).world()
+    world = load_model(tmp_path / content["model"]).build_world()
     assert float(world.cloth.effects["air"].normal.value) == pytest.approx(content["causes"][0]["amplitude"])
 
 
@@ -164,11 +173,13 @@ def test_where_nothing_is_hidden_nothing_is_named():
     withdrawn = replace(answer.search, withdrawn=("air.drag_n",))  # a law did more, and then did not hold
     assert judge(withdrawn, withdrawn.data.motions).verdict == "unexplained"
     end = answer.search.end
-    apart = [torch.full_like(n, 0.03) for n in end.linearisation.mesh_differences]  # m, and N: both meshes fold the cloth elsewhere
+    apart = [
+        torch.full_like(n, 0.03) for n in end.linearisation.mesh_differences
+    ]  # m, and N: both meshes fold the cloth elsewhere
     folded = replace(answer.search, end=replace(end, evidence=replace(end.linearisation, numerics=apart)))
     assert judge(folded, folded.data.motions).verdict == "numerics"
     setting, (first, *others) = answer.search.data, answer.search.data.episodes
-    late = replace(answer.search, setting=replace(setting, episodes=(replace(first, dropped=3), *others)))
+    late = replace(answer.search, setting=replace(setting, episodes=(replace(first, frames_after_motion=3), *others)))
     assert any("come after the motion's end" in text for text in judge(late, setting.motions).content["warnings"])
 
 

@@ -6,8 +6,8 @@ import pytest
 import torch
 from helpers import linear_evidence as toys
 
-from torchcloth.diagnosis.causes.fabric import OF_BENDING, OF_MEMBRANE
-from torchcloth.diagnosis.causes.hypotheses import known
+from torchcloth.diagnosis.causes.fabric import BENDING_EFFECTS, MEMBRANE_EFFECTS
+from torchcloth.diagnosis.causes.hypotheses import list_known_hypotheses
 from torchcloth.diagnosis.decide import search
 from torchcloth.diagnosis.inference.heterogeneity import LAWS, propose_from_heterogeneity
 
@@ -21,36 +21,42 @@ def fitted(apart, name="bending.stiffness"):
         ev.bins[k] = c._replace(value=c.value - (1, -1, 1, -1)[k] * apart * c.jacobian[:, 1])
     there = toys.fitted(ev)
     parameters = (there.model.parameters[0], replace(there.model.parameters[1], name=name))
-    return replace(there, model=replace(there.model, parameters=parameters, values=torch.tensor([0.2, -0.4]).double()))
+    return replace(
+        there, model=replace(there.model, parameters=parameters, coordinates=torch.tensor([0.2, -0.4]).double())
+    )
 
 
-@pytest.mark.parametrize(("name", "effects"), [("bending.stiffness", OF_BENDING), ("youngs_modulus", OF_MEMBRANE)])
+@pytest.mark.parametrize(
+    ("name", "effects"), [("bending.stiffness", BENDING_EFFECTS), ("youngs_modulus", MEMBRANE_EFFECTS)]
+)
 def test_causes_of_a_disputed_law_are_begun_both_ways_at_their_size(name, effects):
-    begun = propose_from_heterogeneity(fitted(0.5, name), NAMES, known())
+    begun = propose_from_heterogeneity(fitted(0.5, name), NAMES, list_known_hypotheses())
     assert {h.effect for h, _ in begun} == set(effects)
     for h, model in begun:
-        assert model.values.tolist() == [0.2, 0.0]  # back at its sheet; the other stays
+        assert model.coordinates.tolist() == [0.2, 0.0]  # back at its sheet; the other stays
         assert abs(model.amplitudes[-1]) == abs(h.typical)
     ways = [model.amplitudes[-1] for h, model in begun if h.signed]
     assert sum(ways) == pytest.approx(0.0)
 
 
 def test_motions_that_agree_dispute_nothing():
-    assert propose_from_heterogeneity(fitted(0.02), NAMES, known()) == []
-    assert propose_from_heterogeneity(fitted(0.5, "areal_density"), NAMES, known()) == []
+    assert propose_from_heterogeneity(fitted(0.02), NAMES, list_known_hypotheses()) == []
+    assert propose_from_heterogeneity(fitted(0.5, "areal_density"), NAMES, list_known_hypotheses()) == []
 
 
 def test_two_motions_are_too_few_to_tell_the_odd_one():
-    assert propose_from_heterogeneity(fitted(0.5), ["a", "a", "b", "b"], known()) == []
+    assert propose_from_heterogeneity(fitted(0.5), ["a", "a", "b", "b"], list_known_hypotheses()) == []
 
 
 def test_the_laws_are_the_catalogues():
-    assert {effect for _, own in LAWS.values() for effect in own} <= {h.effect for h in known()}
+    assert {effect for _, own in LAWS.values() for effect in own} <= {h.effect for h in list_known_hypotheses()}
 
 
 def test_where_nothing_is_disputed_nothing_is_fitted(monkeypatch):
-    monkeypatch.setattr(search, "one_step", lambda *_: pytest.fail("nothing to try"))
+    monkeypatch.setattr(search, "evaluate_candidates", lambda *_: pytest.fail("nothing to try"))
     start = fitted(0.02)
-    chain = search._of_disputed(start, type("S", (), {"names": NAMES})(), known(), lambda _: None)
+    chain = search._search_heterogeneous(
+        start, type("S", (), {"names": NAMES})(), list_known_hypotheses(), lambda _: None
+    )
     assert chain.accepted == []
     assert chain.fit is start

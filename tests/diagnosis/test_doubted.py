@@ -31,7 +31,7 @@ def doubted(monkeypatch, cause, law, useful=True):
     start, end, other = models(cause, law)
     best = SimpleNamespace(fitted=other, alone=set(), hypothesis=toys.hypothesis("a"))
     own = SimpleNamespace(best=SimpleNamespace(alone=set(), hypothesis=toys.hypothesis("c")))
-    monkeypatch.setattr(search, "one_step", lambda *_: SimpleNamespace(best=best) if useful else None)
+    monkeypatch.setattr(search, "evaluate_candidates", lambda *_: SimpleNamespace(best=best) if useful else None)
     first = predict_held_out(reweight_by_noise(start, end.noise, end.linearisation), NAMES)
     whole = compare(first, predict_held_out(end, NAMES), 0.0)
     setting = SimpleNamespace(names=NAMES, recordings=(), episodes=())

@@ -9,8 +9,8 @@ from scipy.stats import t as student
 
 from torchcloth.diagnosis import estimate_force_drifts
 from torchcloth.diagnosis.data.binning import BLOCK_NAMES, FORCE_BLOCK
-from torchcloth.diagnosis.inference.force_drift import _beyond, _pooled
-from torchcloth.diagnosis.inference.lack_of_fit import SENSOR
+from torchcloth.diagnosis.decide.criteria import CRITERIA
+from torchcloth.diagnosis.inference.force_drift import _beyond, _pool_motions
 from torchcloth.diagnosis.inference.noise import Noise
 
 TARE = 0.1  # N
@@ -22,7 +22,7 @@ def evidence(seed, *rates):
     """Forces of five grippers and one axis more in each episode, which grow along z by a rate [N/s] for each."""
     rng = torch.Generator().manual_seed(seed)
     blank = toys.evidence(SLOPES, 1, [], torch.zeros(1).double(), seed)
-    level = torch.tensor([SENSOR[name] for name in BLOCK_NAMES]).double()
+    level = torch.tensor([CRITERIA.adequacy.sensor_error[name] for name in BLOCK_NAMES]).double()
     cells, std = [], torch.tensor([TARE]).double()
     for c, rate in zip(blank.bins, rates, strict=False):
         c = c._replace(block=torch.full_like(c.block, FORCE_BLOCK), patch=c.channel // 3)
@@ -79,7 +79,7 @@ def test_motions_that_differ_at_random_seldom_pass_for_alike(spread):
     rng = torch.Generator().manual_seed(0)
     known = 0.6 * torch.rand(2000, 6, generator=rng).double() + 0.7
     rates = torch.randn(2000, 6, generator=rng).double() * (known + spread**2).sqrt()
-    pooled = [_pooled(rate, variance) for rate, variance in zip(rates, known, strict=True)]
+    pooled = [_pool_motions(rate, variance) for rate, variance in zip(rates, known, strict=True)]
     chances = [3 * _beyond(abs(mean) / std, freedom) for mean, std, freedom in pooled]
     assert sum(p < 0.01 for p in chances) / 2000 < 0.02  # a normal distribution: 0.03 and more where they differ much
 

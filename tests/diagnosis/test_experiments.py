@@ -15,16 +15,23 @@ from helpers.undecided_search import undecided
 
 from torchcloth.diagnosis import build_base_model, prepare_data
 from torchcloth.diagnosis.data.dataset import extend_for_clock
-from torchcloth.diagnosis.decide.candidates import HARDLY
+from torchcloth.diagnosis.decide.criteria import CRITERIA
 from torchcloth.diagnosis.experiment import proposal
-from torchcloth.diagnosis.experiment.motions import EXPERIMENTS, MOTIONS, Experiment, measure_heading, make_episode, list_experiments
+from torchcloth.diagnosis.experiment.motions import (
+    EXPERIMENTS,
+    MOTIONS,
+    Experiment,
+    list_experiments,
+    make_episode,
+    measure_heading,
+)
 from torchcloth.diagnosis.experiment.proposal import (
     OpenQuestion,
-    simulate_measurements,
     compute_chi2,
     compute_information,
-    propose_experiment,
     find_open_question,
+    propose_experiment,
+    simulate_measurements,
     simulate_whitened_slopes,
 )
 from torchcloth.diagnosis.inference.linearise import central_differences
@@ -115,7 +122,10 @@ def test_distances_are_those_of_two_columns():
         return float((target[:, None] - columns @ best).square().sum())
 
     wide = lambda k: torch.cat([white[:, 2 + k], torch.zeros(2).double()])  # noqa: E731
-    beyond = lambda j, target: left(torch.cat([fitted, wide(j)[:, None]], 1), target) - HARDLY * left(fitted, target)  # noqa: E731
+    beyond = lambda j, target: (
+        left(torch.cat([fitted, wide(j)[:, None]], 1), target)
+        - CRITERIA.candidate.simulator_tolerance * left(fitted, target)
+    )  # noqa: E731
     one, other = beyond(0, 0.7 * wide(2)), beyond(2, 0.4 * wide(0))
     assert told == pytest.approx(min(one, other), rel=1e-6)
     again = white[: len(white) // 2][:, [0, 1, 4, 2]]
@@ -140,11 +150,15 @@ def test_gravity_and_camera_are_told_apart_by_turning(said, monkeypatch):
     now = compute_chi2(question, compute_information(question, []))
     told = {}
     for name in ("hang", "turn"):
-        slopes = simulate_whitened_slopes(question, make_episode(Experiment(name, -90.0), setting.recordings[0]), setting)
+        slopes = simulate_whitened_slopes(
+            question, make_episode(Experiment(name, -90.0), setting.recordings[0]), setting
+        )
         told[name] = min(compute_chi2(question, compute_information(question, [slopes])).values())
-    monkeypatch.setattr(proposal, "central", smooth)
+    monkeypatch.setattr(proposal, "central_differences", smooth)
     calm = simulate_whitened_slopes(question, make_episode(Experiment("turn", -90.0), setting.recordings[0]), setting)
-    assert min(compute_chi2(question, compute_information(question, [calm])).values()) > told["turn"]  # ripples tell less
+    assert (
+        min(compute_chi2(question, compute_information(question, [calm])).values()) > told["turn"]
+    )  # ripples tell less
     least = min(now.values())
     assert told["turn"] - least > 10 * (told["hang"] - least) >= 0
 
@@ -174,7 +188,9 @@ def test_an_experiment_feels_what_the_data_felt():
     seen = replace(seen, grippers=pulled)
     model = build_base_model(seen)
     setting = prepare_data(model, [seen])
-    blank = extend_for_clock(build_episode(model.base.cloth, replace(make_episode(Experiment("hang"), seen), joints={})))
+    blank = extend_for_clock(
+        build_episode(model.base.cloth, replace(make_episode(Experiment("hang"), seen), joints={}))
+    )
     felt = simulate_measurements(model.build_world().simulate_observed(blank), blank, setting).wrenches["left"]
     assert felt[1:, :3].isfinite().all()
     assert felt[:, 3:].isnan().all()

@@ -7,15 +7,15 @@ import torch
 from helpers import sheet_episodes
 
 from torchcloth._utils.caching import LRUCache
-from torchcloth.diagnosis.causes.hypotheses import catalogue
+from torchcloth.diagnosis.causes.hypotheses import list_hypotheses
 from torchcloth.diagnosis.data.binning import align_rows, bin_residuals, finite_differences
 from torchcloth.diagnosis.data.fine_mesh import refine_model
 from torchcloth.diagnosis.inference.episode_simulation import run_episode
-from torchcloth.diagnosis.inference.linearise import linearise_hypotheses, linearise
-from torchcloth.diagnosis.models.base_model import base_model
+from torchcloth.diagnosis.inference.linearise import linearise, linearise_hypotheses
+from torchcloth.diagnosis.models.base_model import build_base_model
 from torchcloth.episodes.world import World
-from torchcloth.episodes.world_cache import Worlds
-from torchcloth.identification.nuisances import Held
+from torchcloth.episodes.world_cache import WorldCache
+from torchcloth.identification.nuisances import GraspOffset
 
 RECORDING = sheet_episodes.episode()
 
@@ -23,28 +23,31 @@ RECORDING = sheet_episodes.episode()
 @pytest.fixture(scope="module")
 def asked(made):
     """Three of the catalogue; the middle one only on the finer mesh."""
-    by = {h.name: h for h in catalogue(made[0], [RECORDING])}
-    return [by["air.drag_n"], replace(by["bend.aniso"], finer=True), by["mass.hem"]]
+    by = {h.name: h for h in list_hypotheses(made[0], [RECORDING])}
+    return [by["air.drag_n"], replace(by["bend.aniso"], needs_fine_mesh=True), by["mass.hem"]]
 
 
 def on_finer(made, hypothesis, key):
     """Slopes by simulations of the finer mesh alone, for the cells of ``key``."""
     model, setting = made
-    finer, world = setting.finer, refine_model(model, [RECORDING])[0].world()
+    finer, world = setting.finer, refine_model(model, [RECORDING])[0].build_world()
     e = finer.episodes[0]
-    base, moved = world.frames(e), hypothesis.apply(world, hypothesis.typical).frames(e)
+    base, moved = world.simulate_observed(e), hypothesis.apply(world, hypothesis.typical).frames(e)
     found = bin_residuals(base, finite_differences(base, [moved], [hypothesis.typical]), e, finer.sheet, finer.rest)
     return align_rows(key, found.key, found.jacobian)[:, 0]
 
 
 def test_creases_are_one():
-    model = base_model(RECORDING)
-    assert [h.name for h in catalogue(model, [RECORDING]) if h.needs_fine_mesh] == ["plast.crease"]
+    model = build_base_model(RECORDING)
+    assert [h.name for h in list_hypotheses(model, [RECORDING]) if h.needs_fine_mesh] == ["plast.crease"]
 
 
 def test_its_column_is_of_the_finer_mesh_and_the_others_as_before(made, asked):
     model, setting = made
-    found, usual = linearise(model, setting, asked), linearise(model, setting, [replace(h, finer=False) for h in asked])
+    found, usual = (
+        linearise(model, setting, asked),
+        linearise(model, setting, [replace(h, needs_fine_mesh=False) for h in asked]),
+    )
     place = found.n_coordinates + 1
     own = found.bins[0].jacobian[:, place]
     assert torch.equal(own, on_finer(made, asked[1], found.bins[0].key))
@@ -64,7 +67,7 @@ def test_who_asks_later_is_told_the_same(made, asked):
 def test_the_point_itself_is_simulated_once(made, asked, monkeypatch, memory, again):
     """On both meshes; beside it each of three causes, one of them on the finer mesh, too."""
     model, setting = made[0], replace(made[1], recent=LRUCache(memory, lambda frames: 1))
-    known, simulate, simulated = linearise(model, setting, asked[:1]), World.simulated, []
+    known, simulate, simulated = linearise(model, setting, asked[:1]), World.simulate, []
 
     def counted(world, *arguments):
         simulated.append(world)
@@ -91,16 +94,16 @@ def test_an_accepted_one_keeps_its_mesh(made, asked):
 def test_without_a_finer_mesh_it_is_as_the_others(made, asked):
     """As where experiments are planned."""
     model, setting = made
-    done = run_episode(Worlds(model), setting.episodes[0], None, asked, with_grasp_shifts=False)
+    done = run_episode(WorldCache(model), setting.episodes[0], None, asked, with_grasp_shifts=False)
     coarse = asked[1].apply(model.world(), asked[1].typical).frames(setting.episodes[0])
     assert torch.equal(done.with_hypotheses[1].x, coarse.x)
 
 
 def test_what_does_nothing_on_the_given_mesh_is_not_simulated_on_the_finer(made, asked):
     model, setting = made
-    (crease,) = (h for h in catalogue(model, [RECORDING]) if h.name == "plast.crease")
+    (crease,) = (h for h in list_hypotheses(model, [RECORDING]) if h.name == "plast.crease")
     e, finer = setting.episodes[0], (setting.finer.episodes[0], None)
-    worlds = Worlds(model, (), setting.finer.base)
+    worlds = WorldCache(model, (), setting.finer.base)
     slack = replace(crease, apply=lambda world, amplitude: world.with_cloth())  # another cloth, which moves alike
     none, some = (run_episode(worlds, e, None, [h], with_grasp_shifts=False, finer=finer) for h in (slack, asked[1]))
     assert (none.fine, none.fine_hypotheses) == (None, set())
@@ -116,7 +119,7 @@ def test_cells_that_are_seen_for_the_first_time_have_slopes_along_nuisances(made
     places = torch.arange(len(first.key)) % 5 == 0
     less = replace(whole, cells=[c.select(~places) if k == 0 else c for k, c in enumerate(whole.bins)])
     again = linearise(model, setting, before=less).bins[0]
-    grasps = len(Held().modes(model.base.cloth, setting.episodes[0]))
+    grasps = len(GraspOffset().initial_shape_modes(model.base.cloth, setting.episodes[0]))
     assert torch.equal(again.key, first.key)
     count = again.jacobian.shape[1] - grasps
     assert torch.equal(again.jacobian[:, :count], first.jacobian[:, :count])

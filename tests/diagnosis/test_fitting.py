@@ -7,9 +7,9 @@ import pytest
 import torch
 from helpers import linear_evidence as toys
 
-from torchcloth.diagnosis.decide.search import _impossible
+from torchcloth.diagnosis.decide.search import _list_not_simulated
 from torchcloth.diagnosis.inference import fitting
-from torchcloth.diagnosis.inference.fitting import fit, add_cause
+from torchcloth.diagnosis.inference.fitting import add_cause, fit
 from torchcloth.diagnosis.inference.linearise import use_nuisance_slopes
 from torchcloth.errors import SimulationDiverged
 
@@ -44,8 +44,8 @@ def looks(monkeypatch):
         seen.append((float(model.point[0]), len(hypotheses)))
         return replace(here, hypotheses=list(hypotheses))
 
-    monkeypatch.setattr(fitting, "gather", gather)
-    monkeypatch.setattr(fitting, "asked_about", asked_about)
+    monkeypatch.setattr(fitting, "linearise", gather)
+    monkeypatch.setattr(fitting, "linearise_hypotheses", asked_about)
     return seen, there.model
 
 
@@ -74,7 +74,7 @@ def test_it_goes_on_while_steps_gain_whatever_slopes_promise(looks, monkeypatch,
     """From 0 to 0.4, where the data are, by 0.2 a step: the third loses, and half of it, where it promised much."""
     seen, model = looks
     ahead = iter(promised)
-    monkeypatch.setattr(fitting, "leap", lambda *_: (torch.tensor([0.2]).double(), next(ahead, 0.0)))
+    monkeypatch.setattr(fitting, "robust_step", lambda *_: (torch.tensor([0.2]).double(), next(ahead, 0.0)))
     found = fit(model, None)  # type: ignore[arg-type]
     assert float(found.model.point[0]) == pytest.approx(0.2 * steps)
     assert len(seen) == tried + 1
@@ -83,7 +83,7 @@ def test_it_goes_on_while_steps_gain_whatever_slopes_promise(looks, monkeypatch,
 def test_causes_are_asked_about_where_it_ends_alone(looks, monkeypatch):
     """Simulating all of them at a step that loses takes longer than the step."""
     seen, model = looks
-    monkeypatch.setattr(fitting, "leap", lambda *_: (torch.tensor([0.9]).double(), 9.0))
+    monkeypatch.setattr(fitting, "robust_step", lambda *_: (torch.tensor([0.9]).double(), 9.0))
     found = fit(model, None, [toys.hypothesis("a")], 1)  # type: ignore[arg-type]
     assert seen == [(0.0, 0), (0.9, 0), (0.0, 1)]
     assert [h.name for h in found.linearisation.hypotheses] == ["a"]
@@ -94,7 +94,7 @@ def test_noise_is_estimated_once_where_a_step_loses(looks, monkeypatch):
     seen, model = looks
     estimate, estimated = fitting.fit_noise, []
     monkeypatch.setattr(fitting, "fit_noise", lambda evidence: estimated.append(evidence) or estimate(evidence))
-    monkeypatch.setattr(fitting, "leap", lambda *_: (torch.tensor([0.9]).double(), 9.0))
+    monkeypatch.setattr(fitting, "robust_step", lambda *_: (torch.tensor([0.9]).double(), 9.0))
     found = fit(model, None, iterations=2)  # type: ignore[arg-type]
     assert [at for at, _ in seen] == [0.0, 0.9, 0.45]
     assert len(estimated) == 2
@@ -105,7 +105,7 @@ def test_what_only_the_later_point_meets_is_no_loss(looks, monkeypatch):
     seen, model = looks
     seen.hidden = 5  # of six
     ahead = iter([9.0])
-    monkeypatch.setattr(fitting, "leap", lambda *_: (torch.tensor([0.2]).double(), next(ahead, 0.0)))
+    monkeypatch.setattr(fitting, "robust_step", lambda *_: (torch.tensor([0.2]).double(), next(ahead, 0.0)))
     assert float(fit(model, None).model.point[0]) == pytest.approx(0.4)  # type: ignore[arg-type]
 
 
@@ -113,7 +113,7 @@ def test_half_a_step_may_gain(looks, monkeypatch):
     """Slopes that lead twice as far as the data are."""
     _, model = looks
     ahead = iter([9.0, 9.0])
-    monkeypatch.setattr(fitting, "leap", lambda *_: (torch.tensor([0.9]).double(), next(ahead, 0.0)))
+    monkeypatch.setattr(fitting, "robust_step", lambda *_: (torch.tensor([0.9]).double(), next(ahead, 0.0)))
     assert float(fit(model, None).model.point[0]) == pytest.approx(0.45)  # type: ignore[arg-type]
 
 
@@ -138,10 +138,10 @@ def test_a_twin_takes_over_what_the_parameter_did():
     slopes[..., 1] = slopes[..., 0]
     there = toys.fitted(toys.evidence(slopes, 1, ["twin"], torch.tensor([0.0, 0.0]).double(), 0), std=0.05)
     sheet = replace(there.model.parameters[0], value=math.exp)
-    model = replace(there.model, parameters=(sheet,)).at(torch.tensor([math.log(1.2)]).double())
+    model = replace(there.model, parameters=(sheet,)).at_point(torch.tensor([math.log(1.2)]).double())
     twin = toys.hypothesis("twin", twin=sheet.name)
     found = add_cause(replace(there, model=model, evidence=replace(there.linearisation, hypotheses=[twin])), twin)
-    amplitude, coordinate = found.amplitudes[0], float(found.values[0])
+    amplitude, coordinate = found.amplitudes[0], float(found.coordinates[0])
     assert amplitude + coordinate == pytest.approx(0.2, abs=0.1)
     assert abs(coordinate) < 0.05 < 0.1 < amplitude
 
@@ -149,9 +149,9 @@ def test_a_twin_takes_over_what_the_parameter_did():
 def test_amplitudes_stop_where_a_world_ends():
     model = toys.fitted(toys.evidence(toys.smooth(1, 2), 1, [], TRUTH, 0)).model
     ortho = toys.hypothesis("elas.ortho", high=0.9)
-    assert model.plus(ortho).at(torch.tensor([0.1, 1.5]).double()).amplitudes == (0.9,)
-    plain = replace(ortho, signed=False, low=0.1)
-    assert model.plus(plain).at(torch.tensor([0.1, -1.5]).double()).amplitudes == (0.1,)
+    assert model.with_hypothesis(ortho).at_point(torch.tensor([0.1, 1.5]).double()).amplitudes == (0.9,)
+    plain = replace(ortho, signed=False, min_amplitude=0.1)
+    assert model.with_hypothesis(plain).at_point(torch.tensor([0.1, -1.5]).double()).amplitudes == (0.1,)
 
 
 def test_cells_that_the_base_model_had_not_keep_their_nuisances():
@@ -170,4 +170,4 @@ def test_what_cannot_be_simulated_beside_a_cause_is_told():
     there = toys.fitted(toys.evidence(toys.smooth(1, 4), 1, ["a", "b"], torch.zeros(3).double(), 0))
     asked = [toys.hypothesis(name) for name in "abcd"]
     model = replace(there.model, accepted=(asked[2],), amplitudes=(0.1,))
-    assert _impossible(replace(there, model=model), asked) == ["d"]
+    assert _list_not_simulated(replace(there, model=model), asked) == ["d"]

@@ -9,10 +9,10 @@ from helpers import linear_evidence as toys
 from helpers import sheet_episodes
 
 from torchcloth import recordings as rec
-from torchcloth.diagnosis import base_model
+from torchcloth.diagnosis import build_base_model
 from torchcloth.diagnosis.data.dataset import prepare_data
-from torchcloth.diagnosis.data.replicate_floor import find_replicate_pairs, estimate_replicate_floor
-from torchcloth.diagnosis.inference.bifurcations import FIRST, _begun, _jumped, drop_bins
+from torchcloth.diagnosis.data.replicate_floor import estimate_replicate_floor, find_replicate_pairs
+from torchcloth.diagnosis.inference.bifurcations import FIRST, _perturb_initial_shape, _select_discontinuous, drop_bins
 from torchcloth.diagnosis.inference.comparison import HeldOutPrediction
 from torchcloth.meshes import topology
 
@@ -54,7 +54,7 @@ def test_repetitions_are_of_one_command(tmp_path):
         kept("f", "lift", {"motion": "lift"}),
         kept("g", "slow", {"motion": "swing"}, turn=0.9),  # another heading
     ]
-    setting = prepare_data(base_model(recordings[0]), recordings)
+    setting = prepare_data(build_base_model(recordings[0]), recordings)
     assert find_replicate_pairs(setting.recordings, setting.episodes) == [(0, 1), (0, 3), (1, 3)]
     free = [replace(e, motion={}) for e in setting.episodes]  # cloth that no gripper drives
     assert find_replicate_pairs(recordings[:2], free[:2]) == [(0, 1)]
@@ -63,15 +63,17 @@ def test_repetitions_are_of_one_command(tmp_path):
 
 def test_first_shapes_are_off_by_smooth_fields_along_the_normal_there_and_back():
     blank = sheet_episodes.episode()
-    model = base_model(blank)
+    model = build_base_model(blank)
     (e,) = prepare_data(model, [blank]).episodes
-    begun = _begun(e, model.world(), torch.Generator().manual_seed(0))
+    begun = _perturb_initial_shape(e, model.build_world(), torch.Generator().manual_seed(0))
     off = [b.initial - e.initial for b in begun]
     assert all(b.needs_settling for b in begun)
-    assert torch.equal(begun[0].initial, _begun(e, model.world(), torch.Generator().manual_seed(0))[0].initial)
+    assert torch.equal(
+        begun[0].initial, _perturb_initial_shape(e, model.build_world(), torch.Generator().manual_seed(0))[0].initial
+    )
     torch.testing.assert_close(off[1], -off[0])
     assert (off[0] - off[2]).norm() > 0.5 * off[0].norm()
-    edges = torch.as_tensor(topology.edges(model.base.cloth.mesh.faces)[0])
+    edges = torch.as_tensor(topology.find_edges(model.base.cloth.mesh.faces)[0])
     for field in (off[0], off[2]):
         assert float(field.square().sum(1).mean().sqrt()) == pytest.approx(FIRST)
         assert float(field[:, 1].square().mean().sqrt()) == pytest.approx(FIRST, rel=0.01)  # the sheet hangs in x and z
@@ -84,10 +86,10 @@ def test_a_cell_that_does_not_follow_its_slope_is_left_out():
     cells = found.linearisation.bins[0]
     step = torch.tensor([0.2]).double()
     follows = cells._replace(value=cells.value + cells.jacobian[:, 0] * 0.2)
-    assert len(_jumped(found.linearisation, 0, [follows, None], [step, step])) == 0
+    assert len(_select_discontinuous(found.linearisation, 0, [follows, None], [step, step])) == 0
     turned = follows._replace(value=follows.value.clone())
     turned.value[[7, 30]] += 0.05
-    keys = _jumped(found.linearisation, 0, [follows, turned], [step, step])
+    keys = _select_discontinuous(found.linearisation, 0, [follows, turned], [step, step])
     assert keys.tolist() == cells.key[[7, 30]].tolist()
     none = torch.zeros(0, dtype=torch.int64)
     less = drop_bins(found, [keys, none, none, none])
@@ -108,6 +110,8 @@ def test_what_forgets_how_it_began_is_left_out_only_where_that_is_more_than_it_i
     moved[:count] += 2e-3
     moved[:12] += 18e-3
     same = torch.zeros(1).double()
-    keys = _jumped(found.linearisation, 0, [seen._replace(value=moved)], [same])
+    keys = _select_discontinuous(found.linearisation, 0, [seen._replace(value=moved)], [same])
     assert keys.tolist() == cells.key[: count if share < 0.5 else 12].tolist()
-    assert len(_jumped(found.linearisation, 0, [seen._replace(value=moved)], [same + 1e-9])) == count  # of parameters
+    assert (
+        len(_select_discontinuous(found.linearisation, 0, [seen._replace(value=moved)], [same + 1e-9])) == count
+    )  # of parameters

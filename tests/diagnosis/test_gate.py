@@ -14,9 +14,9 @@ from helpers import sheet_episodes
 
 from torchcloth import recordings as rec
 from torchcloth.cli import main
-from torchcloth.diagnosis import base_model, check_episodes, diagnose, prepare_data
+from torchcloth.diagnosis import build_base_model, check_episodes, diagnose, prepare_data
 from torchcloth.diagnosis.data.cloud_checks import CheckedEpisode
-from torchcloth.diagnosis.data.data_checks import _stamps
+from torchcloth.diagnosis.data.data_checks import _check_stamps
 from torchcloth.diagnosis.data.dataset import check_positions_observed
 from torchcloth.errors import InvalidInput
 from torchcloth.recordings.images import ImageStream
@@ -196,7 +196,7 @@ def test_two_knots_are_enough_of_a_gripper_that_rests(turned):
         )
         for name, g in turned.grippers.items()
     }
-    assert list(_stamps(replace(turned, grippers=still))) == []
+    assert list(_check_stamps(replace(turned, grippers=still))) == []
 
 
 def test_an_arm_that_was_recorded_with_its_fingers_width_holds_while_they_are_near():
@@ -283,14 +283,14 @@ def test_what_was_not_searched_has_no_model(turned):
 
 def test_forces_alone_do_not_say_where_the_cloth_goes(turned):
     """Nor do points in the frame where the simulation starts, and in the last ones, of which a late clock sees none."""
-    model = base_model(turned)
+    model = build_base_model(turned)
     ends = np.isin(np.arange(len(turned.points)), (0, len(turned.points) - 1))
     blind = [replace(turned, points=None, markers=None, split={"motion": m}) for m in "ab"]
     with pytest.raises(InvalidInput, match="none with points or markers"):
         check_positions_observed(prepare_data(model, blind))
     check_positions_observed(prepare_data(model, [turned, *blind]))
     with pytest.raises(InvalidInput, match="after its first frame"):
-        check_positions_observed(prepare_data(model, [replace(turned, points=turned.points.only(ends))]))
+        check_positions_observed(prepare_data(model, [replace(turned, points=turned.points.select(ends))]))
 
 
 def test_small_episodes_of_the_same_engine_pass():

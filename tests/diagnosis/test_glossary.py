@@ -5,20 +5,20 @@ from pathlib import Path
 import pytest
 
 from torchcloth.diagnosis import Hypothesis, register
-from torchcloth.diagnosis.causes.glossary import GLOSSARY, table
-from torchcloth.diagnosis.causes.hypotheses import known
+from torchcloth.diagnosis.causes.glossary import GLOSSARY, format_catalogue
+from torchcloth.diagnosis.causes.hypotheses import list_known_hypotheses
 from torchcloth.errors import InvalidInput
 
 DOCS = Path(__file__).parents[2] / "docs" / "reference" / "causes.md"
 
 
 def test_every_cause_has_a_sentence_and_no_other_has():
-    assert set(GLOSSARY) == {h.effect for h in known()}
+    assert set(GLOSSARY) == {h.effect for h in list_known_hypotheses()}
     assert all(text.endswith(".") and text.count(". ") == 0 for text in GLOSSARY.values())
 
 
 def test_the_docs_have_the_table():
-    assert table(known()) in DOCS.read_text(encoding="utf-8")
+    assert format_catalogue(list_known_hypotheses()) in DOCS.read_text(encoding="utf-8")
 
 
 def test_a_name_of_the_catalogue_is_not_for_users():

@@ -9,7 +9,8 @@ from helpers import linear_evidence as toys
 
 from torchcloth.diagnosis import measure_lack_of_fit
 from torchcloth.diagnosis.decide import backward_elimination
-from torchcloth.diagnosis.inference.lack_of_fit import RARE, SENSOR, LackOfFit, compare_misfit, has_lack_of_fit
+from torchcloth.diagnosis.decide.criteria import CRITERIA
+from torchcloth.diagnosis.inference.lack_of_fit import LackOfFit, compare_misfit, has_lack_of_fit
 
 NAMES = ["a"]
 SLOPES = toys.smooth(1, 4)  # two parameters, one hypothesis, one nuisance
@@ -19,11 +20,13 @@ MOTIONS = [f"motion {k}" for k in range(toys.EPISODES)]
 @pytest.fixture(autouse=True)
 def _sensor(monkeypatch):
     """The toys' slow errors are known."""
-    monkeypatch.setitem(SENSOR, "points", toys.SLOW)
+    monkeypatch.setitem(CRITERIA.adequacy.sensor_error, "points", toys.SLOW)
 
 
 def left(truth, seed):
-    return measure_lack_of_fit(toys.fitted(toys.evidence(SLOPES, 2, NAMES, torch.tensor(truth).double(), seed)), MOTIONS)
+    return measure_lack_of_fit(
+        toys.fitted(toys.evidence(SLOPES, 2, NAMES, torch.tensor(truth).double(), seed)), MOTIONS
+    )
 
 
 def test_of_a_right_model_the_chances_are_what_they_say():
@@ -51,7 +54,7 @@ def test_what_nothing_explains_is_lacking_and_what_parameters_do_is_not():
 
 def test_small_excess_is_no_lack_even_where_it_is_certain():
     rows = left([0.0, 0.0, 0.35], 1)
-    assert min(row.p_value for row in rows) < RARE
+    assert min(row.p_value for row in rows) < CRITERIA.adequacy.max_p_value
     assert not any(row.is_significant for row in rows)
 
 
@@ -82,9 +85,9 @@ def test_where_most_motions_fold_apart_what_is_held_out_says_how_much_is_mended(
     start = toys.fitted(replace(wrong, numerics=rough))
     end = toys.fitted(replace(wrong, cells=[*right.bins[:3], wrong.bins[3]], numerics=rough))
     assert backward_elimination.fraction_explained(start, end, MOTIONS) == pytest.approx(share, abs=0.1)
-    assert backward_elimination.fraction_explained(start, toys.fitted(replace(right, numerics=rough)), MOTIONS) == pytest.approx(
-        1.0, abs=0.1
-    )
+    assert backward_elimination.fraction_explained(
+        start, toys.fitted(replace(right, numerics=rough)), MOTIONS
+    ) == pytest.approx(1.0, abs=0.1)
 
 
 def test_where_all_motions_fold_apart_more_is_no_mending():
@@ -124,10 +127,14 @@ def test_what_is_explained_is_counted_beyond_what_a_right_model_leaves():
     assert compare_misfit(rows(0.9e-3), rows(0.8e-3)) == 1.0  # nothing was wrong
     assert compare_misfit(rows(5e-3, False), rows(1e-3, False)) == 1.0  # nothing can be said
     other, better = [row("hang", 2e-3, episode=1)], [row("hang", 1e-3, episode=1)]
-    assert compare_misfit(rows(9e-3, False) + other, rows(5e-3) + better) == pytest.approx(1.0)  # of what both can judge
+    assert compare_misfit(rows(9e-3, False) + other, rows(5e-3) + better) == pytest.approx(
+        1.0
+    )  # of what both can judge
     assert compare_misfit(rows(9e-3) + other, rows(5e-3, False) + better) == pytest.approx(1.0)
     calm = [row("hang", 1e-3, 9e-3, episode=1)]
-    assert compare_misfit(rows(5e-3) + calm, rows(13**0.5 * 1e-3) + calm) == pytest.approx(0.5)  # calm makes up for nothing
+    assert compare_misfit(rows(5e-3) + calm, rows(13**0.5 * 1e-3) + calm) == pytest.approx(
+        0.5
+    )  # calm makes up for nothing
     assert compare_misfit(calm, calm + rows(5e-3)) == 0.0
 
 
@@ -153,8 +160,8 @@ def test_a_cause_is_not_doubted_for_what_was_hardly_less_before(monkeypatch, bef
     """Case 029 of b3f2eda: a late clock, gaining 135 in log density, left a stretched sheet lacking a little."""
     toy = toys.fitted(toys.evidence(SLOPES, 2, NAMES, torch.tensor([0.0, 0.0, 0.0]).double(), 0))
     told = iter([[row(m, 1e-3 * r) for m, r in zip(("stretch", "swing"), own, strict=True)] for own in (before, after)])
-    monkeypatch.setattr(backward_elimination, "is_lacking", lambda *_: True)
-    monkeypatch.setattr(backward_elimination, "lack_of_fit", lambda *_: next(told))
+    monkeypatch.setattr(backward_elimination, "has_lack_of_fit", lambda *_: True)
+    monkeypatch.setattr(backward_elimination, "measure_lack_of_fit", lambda *_: next(told))
     assert backward_elimination.fraction_explained(toy, toy, MOTIONS) == pytest.approx(share, abs=0.05)
 
 
@@ -167,9 +174,9 @@ def snapped(found, at, stretches=8):
 
 def test_the_worst_stretch_is_told_and_what_the_others_leave():
     told = snapped(row("swing", 1.5e-3), 7).as_dict()
-    assert told["worst"] == pytest.approx({"from": 1.4, "to": 1.6, "ratio_elsewhere": 1.5})
+    assert told["worst_window"] == pytest.approx({"from": 1.4, "to": 1.6, "ratio_elsewhere": 1.5})
     assert told["ratio"] > 7
-    assert row("swing", 1e-3, stretches=3).as_dict()["worst"] is None
+    assert row("swing", 1e-3, stretches=3).as_dict()["worst_window"] is None
 
 
 @pytest.mark.parametrize(
@@ -181,12 +188,12 @@ def test_motions_that_fit_are_asked_about_causes_where_others_do_not(monkeypatch
     asked = []
     end = SimpleNamespace(noise=None, evidence=None)
     rows = [row(name, 10.0 if name in lacking else 1.0, 1.0) for name in ("a", "b", "a")]
-    monkeypatch.setattr(backward_elimination, "lack_of_fit", lambda *_: rows)
-    monkeypatch.setattr(backward_elimination, "weighed_alike", lambda *both: both)
-    monkeypatch.setattr(backward_elimination, "predict", lambda found, names, alone: (found, sorted(alone)))
-    monkeypatch.setattr(backward_elimination, "of_episodes", lambda p, which: asked.append((p[1], which)))
+    monkeypatch.setattr(backward_elimination, "measure_lack_of_fit", lambda *_: rows)
+    monkeypatch.setattr(backward_elimination, "put_on_common_noise", lambda *both: both)
+    monkeypatch.setattr(backward_elimination, "predict_held_out", lambda found, names, alone: (found, sorted(alone)))
+    monkeypatch.setattr(backward_elimination, "select_episodes", lambda p, which: asked.append((p[1], which)))
     monkeypatch.setattr(backward_elimination, "compare", lambda *_: None)
-    monkeypatch.setattr(backward_elimination, "worthwhile", lambda _: gains)
+    monkeypatch.setattr(backward_elimination, "is_worthwhile", lambda _: gains)
     steps = [SimpleNamespace(best=SimpleNamespace(alone={"c"}))]
     assert backward_elimination.supported_only_by_misfit_motions("start", end, steps, ["a", "b", "a"]) == said  # type: ignore[arg-type]
     fit = [k for k, name in enumerate(["a", "b", "a"]) if name not in lacking]

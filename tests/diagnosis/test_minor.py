@@ -7,16 +7,21 @@ import pytest
 from helpers import linear_evidence as toys
 
 from torchcloth.diagnosis.decide import backward_elimination, candidates, search
-from torchcloth.diagnosis.decide.candidates import AcceptedCause, _open, _rival, _themselves
+from torchcloth.diagnosis.decide.candidates import (
+    AcceptedCause,
+    _predicts_as_well,
+    _predicts_clearly_better,
+    drop_implied,
+)
 from torchcloth.diagnosis.decide.search import SearchResult
-from torchcloth.diagnosis.decide.verdict import _minor, _verdict
+from torchcloth.diagnosis.decide.verdict import _decide, _describe_minor
 from torchcloth.diagnosis.inference.comparison import Gain
-from torchcloth.episodes.world import MATTERS, Model
+from torchcloth.episodes.world import RELEVANT_FRACTION, WorldModel
 from torchcloth.errors import SimulationDiverged
 
 SCALE, BIAS = ("obs.depth_scale", 0.015, -0.002), ("obs.depth_bias", 5e-3, -2.5e-3)
 SCALE_LARGE, EXTRINSIC = ("obs.depth_scale", 0.015, 0.01), ("obs.extrinsic[x]", 4e-3, 2.5e-3)
-HEM = ("mass.hem", 0.02, 0.39 * MATTERS * 0.02)
+HEM = ("mass.hem", 0.02, 0.39 * RELEVANT_FRACTION * 0.02)
 
 
 def candidate(name, typical, amplitude, **options):
@@ -27,7 +32,7 @@ def ended(best, *rivals):
     """A search with one cause and what predicts as well."""
     best, *rivals = (candidate(*one) for one in (best, *rivals))
     step = AcceptedCause(best, None, [best, *rivals], rivals, [], None, None)  # type: ignore[arg-type]
-    model = Model(None, (), toys.torch.zeros(0), (best.hypothesis,), (best.amplitude,))  # type: ignore[arg-type]
+    model = WorldModel(None, (), toys.torch.zeros(0), (best.hypothesis,), (best.amplitude,))  # type: ignore[arg-type]
     return SearchResult(None, SimpleNamespace(model=model), [step], [], None, None, 0.0, 0.0, None, None)  # type: ignore[arg-type]
 
 
@@ -36,7 +41,7 @@ def test_rivals_that_would_matter_are_said_and_no_others(order):
     """Whichever of them happens to do a little more."""
     found = ended(*order)
     assert (found.causes, found.minor) == ([], found.accepted)
-    told = _minor(found, found.accepted[0])
+    told = _describe_minor(found, found.accepted[0])
     assert told["effect"] == "obs.depth_scale"
     assert [(r["effect"], r["amplitude"]) for r in told["rivals"]] == [("obs.depth_bias", -2.5e-3)]
 
@@ -65,13 +70,13 @@ def test_what_slopes_cannot_tell_from_a_cause_might_have_to_matter_too(monkeypat
     """
     found = ended(("contact.aniso", -0.5, 0.41), EXTRINSIC)
     (step,), mu = found.accepted, toys.hypothesis("contact.mu", 0.2)
-    step.candidate.hypothesis = replace(step.candidate.hypothesis, kin=kin)
+    step.candidate.hypothesis = replace(step.candidate.hypothesis, structurally_equivalent=kin)
     like = SimpleNamespace(hypothesis=mu, amplitude=asked, gain=1.0)
-    monkeypatch.setattr(search, "alike", lambda before, row, amplitude, others: others)
+    monkeypatch.setattr(search, "find_confounded", lambda before, row, amplitude, others: others)
     found = replace(found, steps=[replace(step, screened=[like])])
     assert (found.causes, found.minor) == ((found.accepted, []) if named else ([], found.accepted))
     if not named:
-        told = _minor(found, found.accepted[0])
+        told = _describe_minor(found, found.accepted[0])
         assert told["effect"] == "contact.mu"
         assert [r["effect"] for r in told["rivals"]] == ["contact.aniso", "obs.extrinsic[x]"]
 
@@ -80,22 +85,26 @@ def test_a_rival_that_joins_the_model_beside_a_cause_is_none_any_more():
     """Neither could be dropped then: they are two."""
     found = ended(SCALE_LARGE, BIAS, EXTRINSIC)
     other = candidate(*BIAS)
-    model = Model(None, (), toys.torch.zeros(0), (*found.end.model.accepted, other.hypothesis), (0.01, BIAS[2]))  # type: ignore[arg-type]
+    model = WorldModel(None, (), toys.torch.zeros(0), (*found.end.model.accepted, other.hypothesis), (0.01, BIAS[2]))  # type: ignore[arg-type]
     second = AcceptedCause(other, None, [other], [], [], None, None)  # type: ignore[arg-type]
     both = replace(found, end=SimpleNamespace(model=model), steps=[*found.accepted, second])  # type: ignore[arg-type]
-    assert [h.name for h, _ in found.equivalents(found.accepted[0])] == ["obs.depth_scale", "obs.depth_bias", "obs.extrinsic[x]"]
+    assert [h.name for h, _ in found.equivalents(found.accepted[0])] == [
+        "obs.depth_scale",
+        "obs.depth_bias",
+        "obs.extrinsic[x]",
+    ]
     assert [h.name for h, _ in both.equivalents(both.accepted[0])] == ["obs.depth_scale", "obs.extrinsic[x]"]
 
 
 @pytest.mark.parametrize("doubtful", [True, False])
 def test_what_may_matter_is_not_called_adequate(doubtful):
-    told = _verdict(SimpleNamespace(screened=[]), [], lacking=False, stable=True, doubtful=doubtful)
+    told = _decide(SimpleNamespace(screened=[]), [], lacking=False, stable=True, doubtful=doubtful)
     assert told == ("inconclusive" if doubtful else "adequate")
 
 
 def test_what_brings_another_along_is_no_rival_of_it_where_nothing_else_is_left():
     drag, wind = candidate("air.drag_n", 1.2, 1.2), candidate("air.wind[y]", 0.3, 0.01, brings="air.drag_n")
-    assert not _rival(wind, None, drag)  # type: ignore[arg-type]
+    assert not _predicts_as_well(wind, None, drag)  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize(
@@ -106,9 +115,9 @@ def test_wind_that_does_not_matter_is_not_named_for_the_drag_that_it_brings(ampl
     """Unless it predicts clearly better all the same."""
     drag, wind = candidate("air.drag_n", 1.2, 1.2), candidate("air.wind[y]", 0.3, amplitude, brings="air.drag_n")
     drag.gain, wind.gain = SimpleNamespace(density=density), SimpleNamespace(density=1477.0)
-    found = [c.hypothesis.name for c in _themselves([drag, wind])]  # type: ignore[list-item]
+    found = [c.hypothesis.name for c in drop_implied([drag, wind])]  # type: ignore[list-item]
     assert found == (named or ["air.drag_n", "air.wind[y]"])
-    assert _themselves([wind]) == [wind]  # type: ignore[list-item]
+    assert drop_implied([wind]) == [wind]  # type: ignore[list-item]
 
 
 @pytest.mark.parametrize(
@@ -127,9 +136,9 @@ def test_what_predicts_better_and_motions_disagree_about_is_a_rival(monkeypatch,
     brings = "air.drag_n" if name == "air.wind[y]" else ""
     better, best = candidate(name, 1.2, amplitude, brings=brings), candidate("air.linear", 2.0, 1.7)
     better.gain = best.predicted = None
-    monkeypatch.setattr(candidates, "worthwhile", lambda _: True)
+    monkeypatch.setattr(candidates, "is_worthwhile", lambda _: True)
     monkeypatch.setattr(candidates, "compare", lambda *_: SimpleNamespace(density=over, ci95=ci95))
-    assert _open(better, None, best) == open_  # type: ignore[arg-type]
+    assert _predicts_clearly_better(better, None, best) == open_  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize(
@@ -147,16 +156,16 @@ def test_what_was_brought_along_takes_the_place_of_what_brought_it(monkeypatch, 
     drag, wind = candidate("air.drag_n", 1.2, 1.4), candidate("air.wind[y]", 0.3, 0.2, brings="air.drag_n")
     drag.fitted, drag.alone = None, set()
     camera = toys.hypothesis("obs.extrinsic[y]", 4e-3)
-    base = Model(None, (), toys.torch.zeros(0), (camera,), (4e-3,))  # type: ignore[arg-type]
-    current = SimpleNamespace(model=base.plus(wind.hypothesis, left), evidence=None)
+    base = WorldModel(None, (), toys.torch.zeros(0), (camera,), (4e-3,))  # type: ignore[arg-type]
+    current = SimpleNamespace(model=base.with_hypothesis(wind.hypothesis, left), evidence=None)
     step = AcceptedCause(wind, None, [wind, drag], [drag], [], None, None)  # type: ignore[arg-type]
-    monkeypatch.setattr(backward_elimination, "without_cause", lambda found, name: found.model.without(name))
+    monkeypatch.setattr(backward_elimination, "remove_cause", lambda found, name: found.model.without(name))
     monkeypatch.setattr(
         backward_elimination, "fit", lambda model, *_, **__: SimpleNamespace(model=model, noise=None, evidence=None)
     )
-    monkeypatch.setattr(backward_elimination, "renoised", lambda found, *_: found)
-    monkeypatch.setattr(backward_elimination, "placebo", lambda *_: SimpleNamespace(passed=passed))
-    monkeypatch.setattr(backward_elimination, "predicts_better", lambda *_: over)
+    monkeypatch.setattr(backward_elimination, "reweight_by_noise", lambda found, *_: found)
+    monkeypatch.setattr(backward_elimination, "run_permutation_test", lambda *_: SimpleNamespace(passed=passed))
+    monkeypatch.setattr(backward_elimination, "predictive_gain", lambda *_: over)
     asked = (SimpleNamespace(names=[]), [camera, wind.hypothesis, drag.hypothesis], lambda _: None)
     end, (then,) = backward_elimination.replace_by_implied(current, [step], *asked)  # type: ignore[arg-type]
     assert then.candidate.hypothesis.name == named
@@ -169,7 +178,7 @@ def test_what_was_brought_along_takes_the_place_of_what_brought_it(monkeypatch, 
 
 def test_what_is_there_by_itself_is_not_brought_along_again(monkeypatch):
     drag, wind = candidate("air.drag_n", 1.2, 1.4), candidate("air.wind[y]", 0.3, 0.2, brings="air.drag_n")
-    model = Model(None, (), toys.torch.zeros(0), (wind.hypothesis, drag.hypothesis), (0.01, 1.4))  # type: ignore[arg-type]
+    model = WorldModel(None, (), toys.torch.zeros(0), (wind.hypothesis, drag.hypothesis), (0.01, 1.4))  # type: ignore[arg-type]
     steps = [AcceptedCause(c, None, [wind, drag], [], [], None, None) for c in (wind, drag)]  # type: ignore[arg-type]
     monkeypatch.delattr(backward_elimination, "fit")
     current = SimpleNamespace(model=model)
@@ -180,15 +189,15 @@ def test_what_cannot_be_simulated_without_a_cause_leaves_it_in(monkeypatch):
     """All work up to there would be lost, and a diagnosis that goes on would end there again."""
     drag, law = candidate("air.drag_n", 1.2, 1.4), candidate("b", 1.0, 1.0)
     drag.alone = law.alone = set()
-    model = Model(None, (), toys.torch.zeros(0), (drag.hypothesis, law.hypothesis), (1.4, 1.0))  # type: ignore[arg-type]
+    model = WorldModel(None, (), toys.torch.zeros(0), (drag.hypothesis, law.hypothesis), (1.4, 1.0))  # type: ignore[arg-type]
     steps = [AcceptedCause(c, None, [c], [], [], None, None) for c in (drag, law)]  # type: ignore[arg-type]
     current = SimpleNamespace(model=model, noise=None, evidence=None)
 
     def diverges(*_):
         raise SimulationDiverged("no such world")
 
-    monkeypatch.setattr(backward_elimination, "without_cause", lambda found, name: found.model.without(name))
-    monkeypatch.setattr(backward_elimination, "known", lambda *_: False)
+    monkeypatch.setattr(backward_elimination, "remove_cause", lambda found, name: found.model.without(name))
+    monkeypatch.setattr(backward_elimination, "accept", lambda *_: False)
     monkeypatch.setattr(backward_elimination, "fit", diverges)
     asked = (SimpleNamespace(names=[]), [], lambda _: None)
     assert backward_elimination.drop_redundant(current, steps, *asked) == (current, steps)  # type: ignore[arg-type]
@@ -217,11 +226,11 @@ def test_what_a_parameter_does_already_must_show_beside_its_data_sheet(twin, row
     gain = Gain(1e-3, 1e-3, 5.0, (low, 9.0), 0.0, (0.0, 0.0), (1e-3, 1e-3), (0.0, 0.0), low)
     fitted = SimpleNamespace(model=SimpleNamespace(parameters=[toys.parameter("p")]))
     c = SimpleNamespace(hypothesis=toys.hypothesis("m", twin=twin), fitted=fitted, row=row, bent=0.0)
-    assert candidates.worth_naming(c, gain) == worth  # type: ignore[arg-type]
-    assert not candidates.worthwhile(gain)
-    assert not candidates.worth_naming(c, gain._replace(density=3.0, least=-2.0))  # type: ignore[arg-type]
+    assert candidates.is_improvement(c, gain) == worth  # type: ignore[arg-type]
+    assert not candidates.is_worthwhile(gain)
+    assert not candidates.is_improvement(c, gain._replace(density=3.0, least=-2.0))  # type: ignore[arg-type]
     c.bent = 6.6  # of stiffening, 016 of e9945f3: by slopes beside its prior it need not gain so much
-    assert candidates.worth_naming(c, gain) == (worth or (twin == "p" and row.shows))  # type: ignore[arg-type]
+    assert candidates.is_improvement(c, gain) == (worth or (twin == "p" and row.shows))  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize(
@@ -230,7 +239,7 @@ def test_what_a_parameter_does_already_must_show_beside_its_data_sheet(twin, row
 def test_what_is_sure_is_not_asked_to_mend_much(low, after, worth):
     """Orthotropy of half its size (050 of b3f2eda) gained 44: most of its millimetres had gone into stiffening."""
     gain = Gain(1e-3, after, 20.0, (low, 30.0), 0.0, (0.0, 0.0), (1e-3, 0.995e-3), (2e-4, 3e-3), low)
-    assert candidates.worthwhile(gain) == worth
+    assert candidates.is_worthwhile(gain) == worth
 
 
 @pytest.mark.parametrize(
@@ -239,10 +248,10 @@ def test_what_is_sure_is_not_asked_to_mend_much(low, after, worth):
 def test_what_leaves_all_positions_together_further_off_mends_none(after, pull, worth):
     """Though it does where nothing else goes on, or in one episode; a pull may be mended without them."""
     gain = Gain(1e-3, after, 18.0, (4.0, 33.0), 0.0, (0.0, 0.0), (0.72e-3, 0.70e-3), (4e-4, pull), 5.0)
-    assert candidates.worthwhile(gain) == worth
+    assert candidates.is_worthwhile(gain) == worth
 
 
 def test_what_was_only_felt_has_no_positions():
     nowhere = float("nan")
     gain = Gain(nowhere, nowhere, 18.0, (4.0, 33.0), 0.0, (0.0, 0.0), (0.0, 0.0), (0.0, 1e-2), 5.0)
-    assert candidates.worthwhile(gain)
+    assert candidates.is_worthwhile(gain)

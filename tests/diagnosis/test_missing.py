@@ -4,12 +4,12 @@ import pytest
 import torch
 from helpers import sheet_episodes
 
-from torchcloth.diagnosis import base_model, fit, measure_lack_of_fit, missing_force, prepare_data
+from torchcloth.diagnosis import build_base_model, fit, measure_lack_of_fit, missing_force, prepare_data
 from torchcloth.diagnosis.unknown import missing_force as missing
 from torchcloth.diagnosis.unknown.force_sensitivities import ForcePulses, differentiate_pulses
 from torchcloth.effects import BodyForce
-from torchcloth.episodes.replay import Frames, frames_of
-from torchcloth.pose.objective import joined
+from torchcloth.episodes.replay import Frames, frames_from_rollout
+from torchcloth.pose.objective import concatenate_windows
 
 BEGIN, END = 6, 9  # frames of 0.05 s
 PUSH = torch.tensor([0.0, 2.5, 0.0])  # m/s^2 on the lower left quarter: 0.5 Pa, a quarter of the weight
@@ -35,12 +35,12 @@ def pushed_for_a_while(world, episode):
             state = cloth.settle(state, episode.motion, start=float(episode.times[0]), duration=0.3)
         out = cloth(state, episode.motion, episode.times[first : last + 1])
         state = out.state
-        parts.append(frames_of(out))
-    return joined(parts)
+        parts.append(frames_from_rollout(out))
+    return concatenate_windows(parts)
 
 
 def fitted(recordings):
-    model = base_model(recordings[0])
+    model = build_base_model(recordings[0])
     setting = prepare_data(model, recordings)
     return fit(model, setting), setting
 
@@ -50,7 +50,10 @@ def planted():
     before = torch.get_default_dtype()
     torch.set_default_dtype(torch.float64)
     still = lambda world: world  # noqa: E731
-    recordings = [sheet_episodes.recorded("slow", still, 0, pushed_for_a_while), sheet_episodes.recorded("fast", still, 1)]
+    recordings = [
+        sheet_episodes.recorded("slow", still, 0, pushed_for_a_while),
+        sheet_episodes.recorded("fast", still, 1),
+    ]
     yield fitted(recordings)
     torch.set_default_dtype(before)
 
@@ -70,7 +73,7 @@ def test_it_is_found_there_and_then(planted):
     assert float(total[1]) == pytest.approx(0.2 * float(PUSH[1]) * sheet_episodes.SIDE**2 / 4, rel=0.25)
     assert float(elsewhere.certainty.max()) < 0.5 * float(there.certainty.max())
     told = answer.as_dict()["motions"]
-    assert [t["sure"] for t in told] == [True, False]
+    assert [t["is_significant"] for t in told] == [True, False]
     assert max(told[0]["at"]) < 0.5 * sheet_episodes.SIDE
 
 
@@ -104,7 +107,7 @@ def test_memory_does_not_change_what_is_asked(planted, monkeypatch, at_once):
     moved = Frames(torch.randn(7, *x.shape), torch.randn(7, *x.shape), {}, torch.zeros(7, len(x)))
     frames = Frames(x, torch.zeros_like(x), {}, x.new_zeros(len(x)))
     plain = missing.whiten_with_force(found, setting, 0, frames, moved, 100)
-    monkeypatch.setattr(missing, "AT_ONCE", at_once)
+    monkeypatch.setattr(missing, "MAX_SLOPES_AT_ONCE", at_once)
     assert all(map(torch.equal, missing.whiten_with_force(found, setting, 0, frames, moved, 100), plain))
 
 
@@ -120,14 +123,14 @@ def test_where_pushes_grow_without_end_nothing_is_asked(planted, monkeypatch, si
         return frames, moved if episode is not unstable else moved._replace(x=torch.where(late, size, moved.x))
 
     plain = missing_force(found, setting, window=STRETCH)
-    monkeypatch.setattr(missing, "pushed", growing)
+    monkeypatch.setattr(missing, "differentiate_pulses", growing)
     answer = missing_force(found, setting, window=STRETCH)
     assert [part.unstable_from for part in answer.motions] == [None, pytest.approx(0.4)]
     assert answer.motions[0].force == pytest.approx(plain.motions[0].force, rel=0.05, abs=0.02 * answer.weight)
     assert bool(answer.motions[1].force.isfinite().all())
     late = answer.motions[1].windows[:, 0] > 0.5
     assert float(answer.motions[1].certainty[late].max()) < 1e-6
-    assert [m["until"] for m in answer.as_dict()["motions"]] == [None, pytest.approx(0.4)]
+    assert [m["unstable_from"] for m in answer.as_dict()["motions"]] == [None, pytest.approx(0.4)]
 
 
 def test_slopes_of_any_size_have_a_posterior():
@@ -137,12 +140,12 @@ def test_slopes_of_any_size_have_a_posterior():
     value = torch.randn(40, generator=rng, dtype=torch.float64)
     known, sizes = torch.full((3,), 4.0, dtype=torch.float64), torch.full((9,), 0.7, dtype=torch.float64)
     information, asked = slopes.mT @ slopes, slopes.mT @ value
-    found = missing._posterior(information, asked, known, sizes)
+    found = missing._solve_posterior(information, asked, known, sizes)
     precision = information + torch.diag(torch.cat([known, sizes**-2]))
     assert found.covariance == pytest.approx(torch.linalg.inv(precision).numpy(), rel=1e-9, abs=1e-12)
     assert found.mean == pytest.approx((-torch.linalg.solve(precision, asked)).numpy(), rel=1e-9)
     fewer = torch.cat([1e9 * slopes[:, :1], 1e9 * slopes[:, :1] + 1e-9 * slopes[:, 1:2], slopes[:, 2:]], 1)
-    wild = missing._posterior(fewer.mT @ fewer, fewer.mT @ value, known, 1e3 * sizes)
+    wild = missing._solve_posterior(fewer.mT @ fewer, fewer.mT @ value, known, 1e3 * sizes)
     assert bool(wild.mean.isfinite().all() and wild.log.isfinite())
     assert bool((wild.covariance.diagonal() > 0).all())
     with pytest.raises(torch.linalg.LinAlgError):

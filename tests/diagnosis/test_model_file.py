@@ -13,9 +13,9 @@ from helpers import sheet_episodes
 
 from torchcloth import recordings as rec
 from torchcloth.cli import main
-from torchcloth.diagnosis import base_model, catalogue, read_model, save_model
+from torchcloth.diagnosis import build_base_model, list_hypotheses, read_model, save_model
 from torchcloth.errors import RecordingError
-from torchcloth.identification.io.saved_fit import mark
+from torchcloth.identification.io.saved_fit import fingerprint
 
 RECORDING = sheet_episodes.episode(resolution=(4, 4))
 
@@ -25,12 +25,14 @@ def sound(tmp_path_factory):
     """A file with a cause, a covariance, a residual force's numbers, and the mark of an episode."""
     before = torch.get_default_dtype()
     torch.set_default_dtype(torch.float64)
-    base = base_model(RECORDING)
-    by = {h.name: h for h in catalogue(base, [RECORDING])}
-    model = base.plus(by["air.drag_n"], 1.5)
+    base = build_base_model(RECORDING)
+    by = {h.name: h for h in list_hypotheses(base, [RECORDING])}
+    model = base.with_hypothesis(by["air.drag_n"], 1.5)
     covariance = torch.eye(6, dtype=torch.float64)
     path = tmp_path_factory.mktemp("model") / "sound.tcm"
-    yield save_model(path, model, RECORDING, covariance, model.plus(by["obs.clock"], 0.01), [mark(RECORDING)])
+    yield save_model(
+        path, model, RECORDING, covariance, model.with_hypothesis(by["obs.clock"], 0.01), [fingerprint(RECORDING)]
+    )
     torch.set_default_dtype(before)
 
 
@@ -92,11 +94,11 @@ DAMAGE = {
 
 def test_friction_ends_where_there_is_none_also_when_it_comes_from_a_file(tmp_path):
     table = {"table": rec.Collider(np.zeros(3), np.array([0.0, 0.0, 1.0]), 0.3)}
-    base = base_model(on := replace(RECORDING, colliders=table))
-    (cause,) = (h for h in catalogue(base, [on]) if h.name == "contact.mu")
-    path = save_model(tmp_path / "m.tcm", base.plus(cause, 0.2), on)
+    base = build_base_model(on := replace(RECORDING, colliders=table))
+    (cause,) = (h for h in list_hypotheses(base, [on]) if h.name == "contact.mu")
+    path = save_model(tmp_path / "m.tcm", base.with_hypothesis(cause, 0.2), on)
     (again,) = read_model(path, on).model.accepted
-    assert again.low == cause.low == pytest.approx(-0.299)
+    assert again.min_amplitude == cause.min_amplitude == pytest.approx(-0.299)
 
 
 @pytest.mark.parametrize("case", DAMAGE)
@@ -131,7 +133,7 @@ def test_what_is_sound_is_read(sound, tmp_path):
     assert [h.name for h in whole.model.accepted] == ["air.drag_n", "obs.clock"]
     assert [h.name for h in part.model.accepted] == ["air.drag_n"]
     assert whole.covariance.shape == (6, 6)
-    assert whole.episodes == [mark(RECORDING)]
+    assert whole.episodes == [fingerprint(RECORDING)]
     assert whole.scene.grasps["left"].radius == RECORDING.grasps["left"].radius
     assert read_model(spoiled(sound, tmp_path / "old.tcm", put("episodes", value=None))).episodes == []
 
@@ -148,13 +150,13 @@ def test_verbs_say_it_in_one_line(sound, tmp_path, capsys):
 
 
 def test_a_plain_number_may_be_as_large_as_it_was_fitted(tmp_path):
-    base = base_model(RECORDING)
+    base = build_base_model(RECORDING)
     k = [p.name for p in base.parameters].index("stiffening")
-    values = base.values.clone()
+    values = base.coordinates.clone()
     values[k] = 15.0
-    path = save_model(tmp_path / "m.tcm", replace(base, values=values), RECORDING)
-    assert read_model(path).model.values[k] == 15.0
+    path = save_model(tmp_path / "m.tcm", replace(base, coordinates=values), RECORDING)
+    assert read_model(path).model.coordinates[k] == 15.0
     values[0] = 15.0  # a logarithm
-    path = save_model(tmp_path / "m.tcm", replace(base, values=values), RECORDING)
+    path = save_model(tmp_path / "m.tcm", replace(base, coordinates=values), RECORDING)
     with pytest.raises(RecordingError, match="within 14"):
         read_model(path)

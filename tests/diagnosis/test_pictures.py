@@ -9,7 +9,7 @@ import torch
 from helpers import sheet_episodes
 
 from torchcloth import diagnosis as dx
-from torchcloth.diagnosis.data.binning import BLOCK_NAMES, BIN_SECONDS
+from torchcloth.diagnosis.data.binning import BIN_SECONDS, BLOCK_NAMES
 from torchcloth.diagnosis.inference.screening import ScoreTest
 from torchcloth.diagnosis.report.fabric_maps import choose_misfit_limit, draw_misfit_maps
 from torchcloth.diagnosis.report.pictures import FARTHEST, draw_residual_maps, draw_scores
@@ -21,8 +21,8 @@ def gathered():
     before = torch.get_default_dtype()
     torch.set_default_dtype(torch.float64)
     blank = sheet_episodes.episode()
-    wind = next(h for h in dx.catalogue(dx.base_model(blank), [blank]) if h.name == "air.wind[y]")
-    model = dx.base_model(blank)
+    wind = next(h for h in dx.list_hypotheses(dx.build_base_model(blank), [blank]) if h.name == "air.wind[y]")
+    model = dx.build_base_model(blank)
     setting = dx.prepare_data(model, [sheet_episodes.recorded("slow", lambda world: wind.apply(world, 0.5), 3)])
     yield dx.linearise(model, setting), setting
     torch.set_default_dtype(before)

@@ -17,11 +17,11 @@ def with_cause(amplitude: float, seed: int, slopes=SLOPES):
     """A fitted model with the cause, of data that have so much of it."""
     ev = toys.evidence(slopes, 3, [], torch.tensor([0.1, -0.1, amplitude]).double(), seed)
     found = toys.fitted(ev)
-    model = replace(found.model, parameters=found.model.parameters[:2], values=found.model.values[:2])
-    model = model.plus(toys.hypothesis("cause"))
+    model = replace(found.model, parameters=found.model.parameters[:2], coordinates=found.model.coordinates[:2])
+    model = model.with_hypothesis(toys.hypothesis("cause"))
     step, _ = robust_step(found.whitened, model)
     there = found.whitened._replace(value=found.whitened.value + found.whitened.jacobian[:, :3] @ step)
-    return replace(found, model=model.at(step), white=reweight(there))
+    return replace(found, model=model.at_point(step), white=reweight(there))
 
 
 def test_a_cause_beats_its_placebos():
@@ -49,4 +49,6 @@ def test_what_is_alike_everywhere_is_no_placebo_of_itself():
         steady = SLOPES.clone()
         windows = 1 - share * torch.rand(toys.EPISODES, toys.WINDOWS, generator=rng).double()
         steady[..., 2] = 4e-3 * windows[:, toys.grid().window]
-        assert all(run_permutation_test(with_cause(1.0, seed, steady), MOTIONS, seed=seed).is_passed for seed in range(6))
+        assert all(
+            run_permutation_test(with_cause(1.0, seed, steady), MOTIONS, seed=seed).is_passed for seed in range(6)
+        )

@@ -24,7 +24,7 @@ def made():
     before = torch.get_default_dtype()
     torch.set_default_dtype(torch.float64)
     blank = sheet_episodes.episode()
-    model = dx.base_model(blank)
+    model = dx.build_base_model(blank)
     yield model, prepare_data(model, [blank]).episodes[0], blank
     torch.set_default_dtype(before)
 
@@ -62,7 +62,7 @@ def test_a_wider_patch_grows_on_all_sides_and_the_next_grows_from_there(made):
 def test_little_does_little_and_twice_as_much_twice_as_much(made):
     """Whole vertices would do nothing, and then all at once."""
     model, e, blank = made
-    by = {h.name: h for h in dx.catalogue(model, [blank])}
+    by = {h.name: h for h in dx.list_hypotheses(model, [blank])}
     base = model.world().frames(e).x
     for name in ("grip.width", "robot.regrasp"):
         moved = [float((model.world([(by[name], a)]).frames(e).x - base).norm()) for a in (1e-4, 1e-3, 2e-3)]
@@ -77,27 +77,27 @@ def test_nobody_sees_another_mesh(made):
     u, v = torch.as_tensor(world.cloth.mesh.uv).T
     shape = torch.stack([u - u * u, 3 * u * v, v + 2 * v * v], 1)
     other = move_grip_patches(world, wider=0.01, along=0.005)
-    there = other.driven(replace(e, initial=shape)).initial
+    there = other.apply_motion(replace(e, initial=shape)).initial
     assert float((there - shape).norm(dim=1).max()) > 5e-3
     still = Frames(there[None], 2 * there[None], {}, torch.zeros(1))
-    seen = other.seen(still, e)
+    seen = other.observe(still, e)
     torch.testing.assert_close(seen.x[0], shape, atol=1e-8, rtol=0)
     torch.testing.assert_close(seen.v[0], 2 * shape, atol=1e-8, rtol=0)
 
 
 def test_a_model_of_an_episode_starts_where_the_episode_says(made, tmp_path):
     model, _, blank = made
-    by = {h.name: h for h in dx.catalogue(model, [blank])}
+    by = {h.name: h for h in dx.list_hypotheses(model, [blank])}
     path = dx.save_model(tmp_path / "held.tcm", model.plus(by["robot.regrasp"], 0.008), blank)
-    cloth = dx.cloth_for(path, blank)
+    cloth = dx.load_cloth_for(path, blank)
     first = build_episode(cloth, blank).initial
     u, bulge, v = (first - torch.tensor([0.0, 0.0, 1.0])).T.numpy()
     np.testing.assert_allclose(np.stack([u, v], 1), cloth.mesh.uv, atol=1e-6)
     np.testing.assert_allclose(bulge, 0.01 * np.sin(8 * cloth.mesh.uv[:, 0]), atol=1e-4)
     seen = sheet_episodes.recorded("fast", lambda world: world, 3)
-    found = dx.predicted(path, rec.read(rec.write(seen, tmp_path / "fast")))
+    found = dx.predict_episode(path, rec.read(rec.write(seen, tmp_path / "fast")))
     world = dx.load_world(path)
-    torch.testing.assert_close(found.frames.x, world.frames(build_episode(model.base.cloth, seen)).x)
+    torch.testing.assert_close(found.frames.x, world.simulate_observed(build_episode(model.base.cloth, seen)).x)
 
 
 def test_grips_without_a_place_and_patterns_without_room(made):

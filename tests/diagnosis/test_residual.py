@@ -7,18 +7,18 @@ import torch
 from helpers import sheet_episodes
 
 from torchcloth.diagnosis import (
-    base_model,
-    catalogue,
+    build_base_model,
     diagnose,
     fit,
     learn_residual_force,
+    list_hypotheses,
     load_model,
-    save_model,
     prepare_data,
+    save_model,
     write_diagnosis,
 )
 from torchcloth.diagnosis.inference.lack_of_fit import has_lack_of_fit
-from torchcloth.diagnosis.unknown.residual_force import RESIDUAL, TERMS
+from torchcloth.diagnosis.unknown.residual_force import RESIDUAL_EFFECT_PREFIX, RESIDUAL_HYPOTHESES
 from torchcloth.effects import AirDrag
 
 HIDDEN = 1.5  # C_n, of air
@@ -35,7 +35,7 @@ def without_air():
     before = torch.get_default_dtype()
     torch.set_default_dtype(torch.float64)
     recordings = recorded(lambda world: world.with_cloth({"air": AirDrag(HIDDEN)}), 0)
-    known = [h for h in catalogue(base_model(recordings[0]), recordings) if h.name == "rest.skew"]
+    known = [h for h in list_hypotheses(build_base_model(recordings[0]), recordings) if h.name == "rest.skew"]
     yield recordings, diagnose(recordings, hypotheses=known)
     torch.set_default_dtype(before)
 
@@ -82,25 +82,25 @@ def test_it_is_written_with_the_answer(without_air, tmp_path):
 
 def test_it_is_kept_with_the_model_and_can_be_left_out(tmp_path):
     recording = sheet_episodes.episode()
-    plain = base_model(recording)
+    plain = build_base_model(recording)
     terms = {"across2": 0.8, "mass@edge": 0.05}
-    extended = plain.at(plain.point + 0.1)
-    for term in TERMS:
-        name = term.name.removeprefix(f"{RESIDUAL}.")
-        extended = extended.plus(term, terms[name]) if name in terms else extended
+    extended = plain.at_point(plain.point + 0.1)
+    for term in RESIDUAL_HYPOTHESES:
+        name = term.name.removeprefix(f"{RESIDUAL_EFFECT_PREFIX}.")
+        extended = extended.with_hypothesis(term, terms[name]) if name in terms else extended
     path = save_model(tmp_path / "m.tcm", plain, recording, residual=extended)
     loaded, left_out = load_model(path), load_model(path, residual=False)
-    own = loaded.world().cloth.effects[RESIDUAL]
+    own = loaded.build_world().cloth.effects[RESIDUAL_EFFECT_PREFIX]
     assert dict(zip(own.terms, own.strength.value.tolist(), strict=True)) == pytest.approx(terms)
-    assert torch.equal(loaded.values, extended.values)
-    assert RESIDUAL not in left_out.world().cloth.effects
-    assert torch.equal(left_out.values, plain.values)
+    assert torch.equal(loaded.coordinates, extended.coordinates)
+    assert RESIDUAL_EFFECT_PREFIX not in left_out.build_world().cloth.effects
+    assert torch.equal(left_out.coordinates, plain.coordinates)
 
 
 def test_a_force_that_is_missing_is_learned():
     """Air, of which the model has none, and nothing else; with an answer around it: the slow tests."""
     recordings = recorded(lambda world: world.with_cloth({"air": AirDrag(HIDDEN)}), 0)
-    model = base_model(recordings[0])
+    model = build_base_model(recordings[0])
     setting = prepare_data(model, recordings)
     residual = learn_residual_force(fit(model, setting), setting)
     assert residual.terms
@@ -110,7 +110,7 @@ def test_a_force_that_is_missing_is_learned():
 
 def test_where_nothing_is_missing_nothing_is_learned():
     recordings = recorded(lambda world: world, 20)
-    model = base_model(recordings[0])
+    model = build_base_model(recordings[0])
     setting = prepare_data(model, recordings)
     residual = learn_residual_force(fit(model, setting), setting)
     assert residual.terms == {}

@@ -11,7 +11,7 @@ from helpers import sheet_episodes
 
 from torchcloth import recordings as rec
 from torchcloth.cli import main
-from torchcloth.diagnosis import base_model, catalogue, diagnose, run
+from torchcloth.diagnosis import build_base_model, diagnose, list_hypotheses, run
 from torchcloth.diagnosis.inference import linearise
 from torchcloth.errors import InvalidInput
 
@@ -22,7 +22,11 @@ ASKED = ("air.drag_n", "obs.extrinsic[y]")
 def episodes():
     before = torch.get_default_dtype()
     torch.set_default_dtype(torch.float64)
-    drag = next(h for h in catalogue(base_model(sheet_episodes.episode()), [sheet_episodes.episode()]) if h.name == "air.drag_n")
+    drag = next(
+        h
+        for h in list_hypotheses(build_base_model(sheet_episodes.episode()), [sheet_episodes.episode()])
+        if h.name == "air.drag_n"
+    )
     yield [sheet_episodes.recorded(m, lambda world: drag.apply(world, 1.5), k) for k, m in enumerate(("slow", "fast"))]
     torch.set_default_dtype(before)
 
@@ -38,12 +42,12 @@ def counted(monkeypatch):
         state["calls"] += 1
         return work(*arguments)
 
-    monkeypatch.setattr(linearise, "piece_of", piece)
+    monkeypatch.setattr(linearise, "simulate_episode", piece)
     return state
 
 
 def test_the_answer_of_a_resumed_diagnosis_is_the_same(episodes, counted, tmp_path):
-    asked = [h for h in catalogue(base_model(episodes[0]), episodes) if h.name in ASKED]
+    asked = [h for h in list_hypotheses(build_base_model(episodes[0]), episodes) if h.name in ASKED]
     search = partial(diagnose, episodes, hypotheses=asked, journal=tmp_path / "progress")
     whole = search()
     total, size = counted["calls"], sum(f.stat().st_size for f in (tmp_path / "progress").iterdir())
@@ -73,14 +77,16 @@ def test_another_diagnosis_is_not_resumed(episodes, counted, tmp_path):
     for edited in (replace(episodes[0], cameras=camera), replace(episodes[0], grippers=open_)):
         with pytest.raises(InvalidInput, match="another fit"):
             diagnose([edited, *episodes[1:]], hypotheses=[], journal=tmp_path / "progress", resume=True)
-    base = base_model(episodes[0])
-    seen = replace(base, base=base.base.with_view(lambda frames, e: frames._replace(x=frames.x + 0.01)))
+    base = build_base_model(episodes[0])
+    seen = replace(
+        base, base=base.base.with_observation_transform(lambda frames, e: frames._replace(x=frames.x + 0.01))
+    )
     with pytest.raises(InvalidInput, match="another fit"):  # a function of the user's, which shows in what it does
         diagnose(episodes, seen, hypotheses=[], journal=tmp_path / "progress", resume=True)
 
 
 def test_the_command_says_how_to_go_on(episodes, counted, tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr(run, "catalogue", lambda *_: [])
+    monkeypatch.setattr(run, "list_hypotheses", lambda *_: [])
     folders = [str(rec.write(e, tmp_path / e.split["motion"])) for e in episodes]
     out, counted["stop"] = tmp_path / "out", 0
     assert main(["diagnose", *folders, "--out", str(out)]) == 130

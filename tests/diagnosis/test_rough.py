@@ -37,7 +37,7 @@ def rippling(monkeypatch):
             cells.append(central_differences(sided, [(0, STEP), (0, -STEP)], 1))
         return replace(there.linearisation, cells=cells)
 
-    monkeypatch.setattr(fitting, "gather", gather)
+    monkeypatch.setattr(fitting, "linearise", gather)
     return there.model
 
 
@@ -47,6 +47,6 @@ def test_a_fit_goes_on_where_ripples_change(rippling):
 
 
 def test_without_roughness_it_stays(rippling, monkeypatch):
-    monkeypatch.setattr(noise, "ROUGH", 0.0)
+    monkeypatch.setattr(noise, "CRITERIA.noise.roughness_steps", 0.0)
     found = fit(rippling, None, iterations=8)  # type: ignore[arg-type]
     assert abs(float(found.model.point[0]) - TRUTH) > 4 * float(found.covariance[0, 0]) ** 0.5

@@ -5,11 +5,11 @@ from concurrent.futures import ThreadPoolExecutor
 import pytest
 from helpers import sheet_episodes
 
-from torchcloth.diagnosis.causes.hypotheses import catalogue
-from torchcloth.diagnosis.models.base_model import base_model
-from torchcloth.episodes.steps import both_ways, shifted
+from torchcloth.diagnosis.causes.hypotheses import list_hypotheses
+from torchcloth.diagnosis.models.base_model import build_base_model
+from torchcloth.episodes.steps import central_steps, shift_model
 from torchcloth.episodes.world import Hypothesis
-from torchcloth.episodes.world_cache import Worlds
+from torchcloth.episodes.world_cache import WorldCache
 from torchcloth.errors import InvalidInput
 
 RECORDING = sheet_episodes.episode()
@@ -17,7 +17,7 @@ RECORDING = sheet_episodes.episode()
 
 @pytest.fixture
 def model():
-    return base_model(RECORDING)
+    return build_base_model(RECORDING)
 
 
 def numbers(world):
@@ -25,18 +25,18 @@ def numbers(world):
 
 
 def test_they_are_those_of_the_model(model):
-    shifts = both_ways(model)
-    worlds = Worlds(model, shifts, model.base)
-    assert numbers(worlds.plain) == numbers(worlds.finest) == numbers(model.world())
-    assert [numbers(w) for w in worlds.beside] == [numbers(shifted(model, *s).world()) for s in shifts]
-    drag = next(h for h in catalogue(model, [RECORDING]) if h.name == "air.drag_n")
-    changed = worlds.changed(drag)
+    shifts = central_steps(model)
+    worlds = WorldCache(model, shifts, model.base)
+    assert numbers(worlds.base) == numbers(worlds.fine) == numbers(model.world())
+    assert [numbers(w) for w in worlds.shifted] == [numbers(shift_model(model, *s).build_world()) for s in shifts]
+    drag = next(h for h in list_hypotheses(model, [RECORDING]) if h.name == "air.drag_n")
+    changed = worlds.with_typical(drag)
     assert changed is not None
     assert numbers(changed) == numbers(drag.apply(model.world(), drag.typical))
 
 
 def test_each_is_made_once_by_many_threads(model):
-    worlds, calls = Worlds(model, both_ways(model)), []
+    worlds, calls = WorldCache(model, central_steps(model)), []
 
     def apply(world, amplitude):
         calls.append(amplitude)
@@ -44,11 +44,11 @@ def test_each_is_made_once_by_many_threads(model):
 
     both = [Hypothesis("a", "-", 2.0, apply, signed=True), Hypothesis("a", "-", -2.0, apply, signed=True)]
     with ThreadPoolExecutor(8) as pool:
-        list(pool.map(lambda k: worlds.changed(both[k % 2]), range(40)))
-        plain = set(map(id, pool.map(lambda _: worlds.plain, range(40))))
+        list(pool.map(lambda k: worlds.with_typical(both[k % 2]), range(40)))
+        plain = set(map(id, pool.map(lambda _: worlds.base, range(40))))
     assert sorted(calls) == [-2.0, 2.0]
     assert len(plain) == 1
-    assert [id(w) for w in worlds.beside] == [id(w) for w in worlds.beside]
+    assert [id(w) for w in worlds.shifted] == [id(w) for w in worlds.shifted]
 
 
 def test_what_no_world_allows_is_none(model):
@@ -57,6 +57,6 @@ def test_what_no_world_allows_is_none(model):
         raise InvalidInput("grip", got="too wide", expected="less")
 
     calls = []
-    worlds, never = Worlds(model), Hypothesis("a", "-", 1.0, apply)
-    assert worlds.changed(never) is worlds.changed(never) is None
+    worlds, never = WorldCache(model), Hypothesis("a", "-", 1.0, apply)
+    assert worlds.with_typical(never) is worlds.with_typical(never) is None
     assert calls == [1.0]

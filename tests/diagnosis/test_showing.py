@@ -24,8 +24,8 @@ def with_cause(change=lambda cells: cells):
     slopes[EPISODE, here, 1] += BUMP
     found = toys.fitted(toys.evidence(slopes, 2, [], torch.zeros(2).double(), 0), std=100.0)
     evidence = replace(found.linearisation, cells=[change(c) for c in found.linearisation.bins])
-    model = replace(found.model, parameters=found.model.parameters[:1], values=found.model.values[:1])
-    model = model.plus(toys.hypothesis("cause", 1.0), AMPLITUDE)
+    model = replace(found.model, parameters=found.model.parameters[:1], coordinates=found.model.coordinates[:1])
+    model = model.with_hypothesis(toys.hypothesis("cause", 1.0), AMPLITUDE)
     return replace(found, evidence=evidence, model=model)
 
 
@@ -37,7 +37,7 @@ def test_it_shows_where_and_when_it_does_what_parameters_do_not():
     answer = told(with_cause())
     assert answer["where"]["at"] == pytest.approx(PLACE.tolist())
     assert answer["when"] == {"episode": 2, "motion": "c", "from": pytest.approx(0.6), "to": pytest.approx(0.8)}
-    assert answer["moves"] == {"value": pytest.approx(AMPLITUDE * BUMP, rel=0.1), "unit": "m"}
+    assert answer["response"] == {"value": pytest.approx(AMPLITUDE * BUMP, rel=0.1), "unit": "m"}
 
 
 def test_what_forces_alone_tell_shows_at_a_gripper():
@@ -46,5 +46,5 @@ def test_what_forces_alone_tell_shows_at_a_gripper():
 
     answer = told(with_cause(felt))
     assert answer["where"] == {"gripper": f"hand {PART}"}
-    assert answer["moves"]["unit"] == "N"
+    assert answer["response"]["unit"] == "N"
     assert answer["when"]["motion"] == "c"

@@ -6,9 +6,9 @@ import pytest
 import torch
 from helpers import sheet_episodes
 
-from torchcloth.diagnosis.causes.hypotheses import catalogue
-from torchcloth.diagnosis.inference.linearise import linearise_hypotheses, linearise
-from torchcloth.episodes.steps import one_way, step_sizes
+from torchcloth.diagnosis.causes.hypotheses import list_hypotheses
+from torchcloth.diagnosis.inference.linearise import linearise, linearise_hypotheses
+from torchcloth.episodes.steps import list_steps, one_sided_steps
 from torchcloth.errors import InvalidInput
 
 RECORDING = sheet_episodes.episode()
@@ -17,7 +17,7 @@ RECORDING = sheet_episodes.episode()
 def test_what_a_parameter_does_already_has_its_slopes(made):
     """By the share of its value, wherever that is; it is not simulated."""
     model, setting = made
-    by, place = {h.name: h for h in catalogue(model, [RECORDING])}, [p.name for p in model.parameters]
+    by, place = {h.name: h for h in list_hypotheses(model, [RECORDING])}, [p.name for p in model.parameters]
     there = model.at(torch.full_like(model.point, 0.1))
     asked = [by["mass.density"], by["air.drag_n"]]
     at_once, before = linearise(there, setting, asked), linearise(there, setting)
@@ -26,14 +26,16 @@ def test_what_a_parameter_does_already_has_its_slopes(made):
         assert [h.name for h in found.hypotheses] == ["air.drag_n", "mass.density"]
         slopes = found.bins[0].jacobian
         own = slopes[:, place.index("areal_density")]
-        torch.testing.assert_close(slopes[:, found.n_coordinates + 1], own, rtol=2e-3, atol=0)  # of a logarithm, by differences
+        torch.testing.assert_close(
+            slopes[:, found.n_coordinates + 1], own, rtol=2e-3, atol=0
+        )  # of a logarithm, by differences
         assert float(own.abs().max()) > 0
 
 
 def test_what_no_world_can_have_is_not_asked_about(made):
     """A patch of 15 mm that is 17 mm further along holds nothing at the edge."""
     model, setting = made
-    (drag,) = (h for h in catalogue(model, [RECORDING]) if h.name == "air.drag_n")
+    (drag,) = (h for h in list_hypotheses(model, [RECORDING]) if h.name == "air.drag_n")
 
     def nowhere(world, amplitude):
         raise InvalidInput("grasp", got="no vertex", expected="a patch with vertices")
@@ -47,7 +49,9 @@ def test_what_no_world_can_have_is_not_asked_about(made):
 def test_who_asks_later_is_told_the_same(made):
     model, setting = made
     asked = [
-        h for h in catalogue(model, [RECORDING]) if h.name in ("bend.aniso", "air.drag_n", "obs.clock", "mass.hem")
+        h
+        for h in list_hypotheses(model, [RECORDING])
+        if h.name in ("bend.aniso", "air.drag_n", "obs.clock", "mass.hem")
     ]
     at_once, known = linearise(model, setting, asked), linearise(model, setting, asked[:1])
     later = linearise_hypotheses(known, model, setting, asked)
@@ -59,8 +63,8 @@ def test_who_asks_later_is_told_the_same(made):
 def test_slopes_along_wind_know_nothing_of_the_drag_that_it_brings(made):
     """It brakes whichever way the wind blows: of one sign it would be in the slope, of the other against it."""
     model, setting = made
-    (wind,) = (h for h in catalogue(model, [RECORDING]) if h.name == "air.wind[x]")
-    alone, known = replace(wind, brings=""), linearise(model, setting)
+    (wind,) = (h for h in list_hypotheses(model, [RECORDING]) if h.name == "air.wind[x]")
+    alone, known = replace(wind, implies=""), linearise(model, setting)
 
     def slope(h):
         found = linearise(model, setting, [h])
@@ -73,7 +77,9 @@ def test_slopes_along_wind_know_nothing_of_the_drag_that_it_brings(made):
     torch.testing.assert_close(slope(wind), 0.5 * (there + back), rtol=1e-9, atol=1e-12)
     torch.testing.assert_close(slope(wind.opposite), slope(wind), rtol=1e-9, atol=1e-12)
     assert (there - back).norm() > 0.1 * (there + back).norm()
-    ends = replace(wind, low=-0.5 * wind.typical)  # what cannot be reversed as a whole is asked about as it is
+    ends = replace(
+        wind, min_amplitude=-0.5 * wind.typical
+    )  # what cannot be reversed as a whole is asked about as it is
     torch.testing.assert_close(
         linearise(model, setting, [ends]).bins[0].jacobian[:, known.n_coordinates], there, rtol=1e-9, atol=1e-12
     )
@@ -85,7 +91,7 @@ def test_steps_end_at_bounds_and_slopes_know_it(made):
     place = [p.name for p in model.parameters].index("poisson_ratio")
     end = model.at(model.point + 9.0 * torch.eye(len(model.point)).double()[place])
     step = model.parameters[place].step
-    assert one_way(end) == [(k, -s if k == place else s) for k, s in step_sizes(end)]
+    assert one_sided_steps(end) == [(k, -s if k == place else s) for k, s in list_steps(end)]
     near, _, back = (
         linearise(end, setting, (), shifts=[(place, s * step)]).bins[0].jacobian[:, 0] for s in (0.5, 1.0, -1.0)
     )
@@ -98,7 +104,7 @@ def test_steps_end_at_bounds_and_slopes_know_it(made):
 
 def test_slopes_are_those_of_finite_steps(made):
     model, setting = made
-    found = linearise(model, setting, [h for h in catalogue(model, [RECORDING]) if h.name == "obs.extrinsic[y]"])
+    found = linearise(model, setting, [h for h in list_hypotheses(model, [RECORDING]) if h.name == "obs.extrinsic[y]"])
     points = found.bins[0].block == 0
     slope = found.bins[0].jacobian[points, found.n_coordinates]
     assert float(slope.abs().median()) == pytest.approx(1.0, abs=0.05)  # the sheet faces y
@@ -120,7 +126,8 @@ def test_slopes_along_parameters_are_central_and_their_disagreement_is_rough(mad
     torch.testing.assert_close(cells.roughness, (0.5 * torch.tensor(steps) * (up - down)).norm(dim=1))
     assert not one.roughness.any()
     ended = replace(
-        model, parameters=(*model.parameters[:-1], replace(model.parameters[-1], low=float(model.values[-1])))
+        model,
+        parameters=(*model.parameters[:-1], replace(model.parameters[-1], min_coordinate=float(model.coordinates[-1]))),
     )
     (sided,) = linearise(ended, setting).bins
     torch.testing.assert_close(sided.jacobian[:, last], up[:, last])

@@ -11,22 +11,22 @@ from helpers import linear_evidence as toys
 from torchcloth.diagnosis.confirmation import Confirmation
 from torchcloth.diagnosis.data.binning import BLOCK_NAMES as KINDS
 from torchcloth.diagnosis.data.binning import FORCE_BLOCK
-from torchcloth.diagnosis.decide.candidates import CLEAR
+from torchcloth.diagnosis.decide.criteria import CRITERIA
 from torchcloth.diagnosis.inference.comparison import (
     HeldOutPrediction,
-    _resampled,
-    predict_as_given,
+    _resample_blocks,
     compare,
-    select_episodes,
-    predict_held_out,
     jackknife,
+    predict_as_given,
+    predict_held_out,
+    select_episodes,
 )
-from torchcloth.diagnosis.inference.confounding import TOLD, find_confounded, correlate_scores, are_fits_confounded
-from torchcloth.diagnosis.inference.fitting import reweight_by_noise, gauss_newton_step, put_on_common_noise
+from torchcloth.diagnosis.inference.confounding import are_fits_confounded, correlate_scores, find_confounded
+from torchcloth.diagnosis.inference.fitting import gauss_newton_step, put_on_common_noise, reweight_by_noise
 from torchcloth.diagnosis.inference.linearise import use_noise_inputs
-from torchcloth.diagnosis.inference.noise import MEMORY, ROUGH, Noise, fit_noise, compute_noise_floor, whiten
-from torchcloth.diagnosis.inference.screening import ScoreTest, _decided, screen
-from torchcloth.diagnosis.report.wording import _is_too_large, _too_large
+from torchcloth.diagnosis.inference.noise import Noise, compute_noise_floor, fit_noise, whiten
+from torchcloth.diagnosis.inference.screening import ScoreTest, _decide, screen
+from torchcloth.diagnosis.report.wording import _is_implausibly_large, _warn_of_large_amplitude
 from torchcloth.errors import InvalidInput
 
 NAMES = ["a", "b", "c"]
@@ -67,7 +67,11 @@ def test_single_stretches_are_surely_no_gain():
     short = [p._replace(window=0 * p.window) for p in (predict_as_given(found), predict_held_out(found, list("abcd")))]
     assert compare(*short, 0.0).density > 0
     assert compare(*short, 0.0).least == -math.inf
-    assert -math.inf < compare(predict_as_given(found), predict_held_out(found, list("abcd")), 0.0).lower_bound_95 < math.inf
+    assert (
+        -math.inf
+        < compare(predict_as_given(found), predict_held_out(found, list("abcd")), 0.0).lower_bound_95
+        < math.inf
+    )
 
 
 def test_without_noise_it_is_exact_and_parameters_do_not_matter():
@@ -139,7 +143,7 @@ def test_the_slow_error_of_depths_is_found_and_is_no_error_of_places():
     rng, size, cells = torch.Generator().manual_seed(3), 1.5e-3, []
     for c in ev.bins:
         times = c.time.unique()
-        memory = torch.linalg.cholesky(torch.exp(-(times[:, None] - times).abs() / MEMORY))
+        memory = torch.linalg.cholesky(torch.exp(-(times[:, None] - times).abs() / CRITERIA.noise.slow_error_time_s))
         off = size * (memory @ torch.randn(len(times), generator=rng).double())[c.window]
         ray = torch.cos(10 * c.rest_position[:, 0])
         cells.append(c._replace(ray=ray, value=c.value + ray * off))
@@ -171,8 +175,8 @@ def test_what_cannot_be_seen_is_not_called_absent():
 
 def test_what_is_too_large_to_be_believed_is_said():
     (small, large) = (asked([0.0, 0.0, 0.0, amplitude, 0.0]) for amplitude in (3.0, 6.0))
-    assert not any(map(_is_too_large, screen(small)))
-    (said,) = (_too_large(r) for r in screen(large) if _is_too_large(r))
+    assert not any(map(_is_implausibly_large, screen(small)))
+    (said,) = (_warn_of_large_amplitude(r) for r in screen(large) if _is_implausibly_large(r))
     assert said.startswith("b asks for ")
     assert "more than 5 is not believed" in said
 
@@ -209,7 +213,7 @@ def test_what_a_fitted_parameter_does_as_well_is_known_by_its_prior_alone():
     hypotheses = [toys.hypothesis("a", twin="p1"), *found.linearisation.hypotheses[1:]]
     found = replace(found, evidence=replace(found.linearisation, hypotheses=hypotheses))
     assert row(found, "a").decision == "unresolvable"
-    far = replace(found, model=found.model.at(torch.tensor([0.0, 4 * 0.5]).double()))
+    far = replace(found, model=found.model.at_point(torch.tensor([0.0, 4 * 0.5]).double()))
     stranger = replace(far, evidence=replace(far.linearisation, hypotheses=[toys.hypothesis("a"), *hypotheses[1:]]))
     apart = ("hypothesis", "size")
     alike = [{k: v for k, v in row(f, "a")._asdict().items() if k not in apart} for f in (far, stranger)]
@@ -226,7 +230,7 @@ def test_beside_a_parameter_that_its_prior_holds_its_twin_asks_for_what_both_wou
     step, _ = gauss_newton_step(found.whitened, found.model)
     cells = [c._replace(value=c.value + c.jacobian[:, :2] @ step) for c in found.linearisation.bins]
     evidence = replace(found.linearisation, cells=cells)
-    there = replace(found, model=found.model.at(step), evidence=evidence, white=whiten(evidence, found.noise))
+    there = replace(found, model=found.model.at_point(step), evidence=evidence, white=whiten(evidence, found.noise))
     both = there.whitened.jacobian[:, :3]
     prior = torch.diag(torch.tensor([0.05**-2, 0.05**-2, 0.0]).double())
     at = torch.nn.functional.pad(there.model.point, (0, 1))
@@ -246,7 +250,7 @@ def test_what_is_rough_is_noise_of_its_stretch():
     plain, wide = (Noise(level).covariance(c[0], none, none[0]) for c in (ev.bins, cells))
     more = (wide - plain).diagonal()
     assert torch.equal(more > 0, rough > 0)
-    torch.testing.assert_close(more[rough > 0], (ROUGH * rough[rough > 0]) ** 2)
+    torch.testing.assert_close(more[rough > 0], (CRITERIA.noise.roughness_steps * rough[rough > 0]) ** 2)
     assert torch.linalg.eigvalsh(wide).min() > 0
 
 
@@ -298,9 +302,11 @@ def test_more_scatter_within_cells_is_no_gain():
     ]
     groups, one, other = ["x", "y", "x", "y"], toys.fitted(ev), toys.fitted(replace(ev, cells=cells))
     like = [reweight_by_noise(found, one.noise, one.linearisation) for found in (one, other)]
-    first, same, more = (predict_held_out(found, groups) for found in (*like, reweight_by_noise(other, one.noise, other.linearisation)))
+    first, same, more = (
+        predict_held_out(found, groups) for found in (*like, reweight_by_noise(other, one.noise, other.linearisation))
+    )
     assert compare(first, same, 1e-3).log_density == pytest.approx(0.0, abs=1e-9)
-    assert abs(compare(first, more, 1e-3).log_density) > CLEAR
+    assert abs(compare(first, more, 1e-3).log_density) > CRITERIA.candidate.equal_density
 
 
 def test_models_that_meet_other_cells_are_compared_on_those_that_both_meet():
@@ -308,7 +314,9 @@ def test_models_that_meet_other_cells_are_compared_on_those_that_both_meet():
     ev = toys.evidence(SLOPES, 2, NAMES, torch.zeros(5).double(), 3)
     rough = replace(ev, cells=[c._replace(rough=1e-3 * torch.rand(len(c.value))) for c in ev.bins])
     fewer = [c.select(slice(5, None)) for c in rough.bins]
-    less = replace(ev, cells=[c._replace(spread=2 * c.row_std) for c in fewer], numerics=[n[5:] for n in ev.mesh_differences])
+    less = replace(
+        ev, cells=[c._replace(spread=2 * c.row_std) for c in fewer], numerics=[n[5:] for n in ev.mesh_differences]
+    )
     for own, taken in zip(ev.bins, use_noise_inputs(ev, less).bins, strict=True):
         assert torch.equal(taken.key, own.key[5:])
         assert torch.equal(taken.row_std, 2 * own.row_std[5:])
@@ -356,7 +364,9 @@ def test_a_true_cause_predicts_motions_that_were_held_out():
     assert gain.explained_fraction > 0.8
     same = compare(without, without, floor)
     assert same.log_density == 0.0
-    assert compare(without, after, 2 * gain.rms_before).explained_fraction == 1.0  # below the floor there is nothing more to gain
+    assert (
+        compare(without, after, 2 * gain.rms_before).explained_fraction == 1.0
+    )  # below the floor there is nothing more to gain
     assert compare(after, without, 2 * gain.rms_before).explained_fraction == -1.0
     assert same.explained_fraction == 0.0
 
@@ -368,7 +378,12 @@ def test_a_wrong_cause_does_not_predict_them():
         ev = toys.evidence(SLOPES, 2, NAMES, torch.zeros(5).double(), 50 + seed)
         more = ev.__class__(ev.bins, 3, ev.hypotheses[1:], ev.nuisance_stds, ev.mesh_differences)
         groups = ["x", "y", "x", "y"]
-        gains.append(compare(predict_held_out(toys.fitted(ev), groups), predict_held_out(toys.fitted(more), groups), 1e-3).log_density_ci95[0] > 0)
+        gains.append(
+            compare(
+                predict_held_out(toys.fitted(ev), groups), predict_held_out(toys.fitted(more), groups), 1e-3
+            ).log_density_ci95[0]
+            > 0
+        )
     assert sum(gains) <= 1
 
 
@@ -388,7 +403,7 @@ def test_what_shows_in_one_episode_shows_however_many_others_there_are():
 def test_what_a_leap_makes_large_is_not_ruled_out_by_slopes(reached, worth, said):
     """Large effects bend the fit until slopes there ask for less than there is."""
     asks = ScoreTest(toys.hypothesis("a"), 0.2, 0.01, 0.0, 400.0, 1e-2, 0.0, reached, worth, "absent")
-    assert _decided(asks) == said
+    assert _decide(asks) == said
 
 
 @pytest.mark.parametrize(
@@ -415,8 +430,8 @@ def test_two_that_were_fitted_are_alike_where_what_lies_between_them_is_within_t
     for louder in (1.0, 3.0):  # by the noise that is given, not by that of the fits
         noise = Noise(found.noise.levels * louder)
         floor = whiten(found.linearisation, noise).jacobian[:, 3].norm() / unit
-        assert are_fits_confounded(found, moved(0.8 * TOLD / float(floor) ** 2), noise)
-        assert not are_fits_confounded(moved(1.3 * TOLD / float(floor) ** 2), found, noise)
+        assert are_fits_confounded(found, moved(0.8 * CRITERIA.confounding.max_chi2 / float(floor) ** 2), noise)
+        assert not are_fits_confounded(moved(1.3 * CRITERIA.confounding.max_chi2 / float(floor) ** 2), found, noise)
 
 
 @pytest.mark.parametrize("stretches", [2, 3, 4])
@@ -425,7 +440,7 @@ def test_intervals_by_stretches_of_time_are_as_wide_as_few_of_them_allow(stretch
     owner, rng = np.arange(6).repeat(stretches), np.random.default_rng(0)
     surely = 0
     for k in range(1000):
-        sums = _resampled(owner, np.random.default_rng(k)) @ rng.standard_normal(len(owner))
+        sums = _resample_blocks(owner, np.random.default_rng(k)) @ rng.standard_normal(len(owner))
         surely += float(np.quantile(sums, 0.025)) > 0
     assert surely / 1000 < 0.06  # 3 to 5 % by so few; 2.5 % of many
 
@@ -439,7 +454,7 @@ def test_a_single_stretch_of_time_confirms_nothing():
     gain = compare(short, better, 0.0)
     assert gain.log_density > 0
     assert gain.log_density_ci95[0] == gain.log_density_ci95[1]
-    assert not Confirmation(gain, {}, 0.0, "the model", ("base.tcm", "extended.tcm"), ["e1"]).confirmed
+    assert not Confirmation(gain, {}, 0.0, "the model", ("base.tcm", "extended.tcm"), ["e1"]).is_confirmed
 
 
 def test_what_is_surely_there_is_present_though_a_usual_amount_of_it_could_not_be_seen():

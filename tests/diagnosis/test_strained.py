@@ -9,10 +9,11 @@ from helpers import linear_evidence as toys
 
 from torchcloth.diagnosis.data.dataset import DiagnosisData
 from torchcloth.diagnosis.decide import candidates, search
-from torchcloth.diagnosis.decide.candidates import Candidate, AcceptedCause
+from torchcloth.diagnosis.decide.candidates import AcceptedCause, Candidate
+from torchcloth.diagnosis.decide.criteria import CRITERIA
 from torchcloth.diagnosis.inference import prior_restarts
 from torchcloth.diagnosis.inference.prior_restarts import refit_from_prior
-from torchcloth.episodes.world import OFTEN
+from torchcloth.episodes.world import STRAINED_PRIOR_STDS
 from torchcloth.errors import SimulationDiverged
 
 CAUSE = toys.hypothesis("cause", 2.0)
@@ -21,18 +22,18 @@ CAUSE = toys.hypothesis("cause", 2.0)
 def found(far: float):
     """A fit with one cause whose first number is ``far`` prior standard deviations from its data sheet."""
     there = toys.fitted(toys.evidence(toys.smooth(1, 2), 1, [], torch.tensor([0.4]).double(), 0), std=0.5)
-    model = there.model.plus(CAUSE, 1.5).at(torch.tensor([0.5 * far, 1.5]).double())
+    model = there.model.with_hypothesis(CAUSE, 1.5).at_point(torch.tensor([0.5 * far, 1.5]).double())
     return replace(there, model=model)
 
 
 def test_a_number_is_strained_beyond_what_data_sheets_are_wrong_by():
-    ((p, far),) = found(OFTEN + 0.2).model.strained
+    ((p, far),) = found(STRAINED_PRIOR_STDS + 0.2).model.strained_parameters
     assert p.name == "p0"
-    assert far == pytest.approx(OFTEN + 0.2)
-    assert found(OFTEN - 0.1).model.strained == []
+    assert far == pytest.approx(STRAINED_PRIOR_STDS + 0.2)
+    assert found(STRAINED_PRIOR_STDS - 0.1).model.strained_parameters == []
 
 
-@pytest.mark.parametrize("ends", [0.3, OFTEN + 1])
+@pytest.mark.parametrize("ends", [0.3, STRAINED_PRIOR_STDS + 1])
 def test_it_begins_at_the_data_sheet_and_is_nothing_where_that_ends_as_far(monkeypatch, ends):
     begun, asked = [], []
 
@@ -41,12 +42,12 @@ def test_it_begins_at_the_data_sheet_and_is_nothing_where_that_ends_as_far(monke
         return found(ends)
 
     monkeypatch.setattr(
-        prior_restarts, "approach", lambda model, setting, progress: (begun.append(model) or model, None)
+        prior_restarts, "quadratic_warm_start", lambda model, setting, progress: (begun.append(model) or model, None)
     )
     monkeypatch.setattr(prior_restarts, "fit", fit)
-    again = refit_from_prior(found(OFTEN + 1), None, [CAUSE])  # type: ignore[arg-type]
+    again = refit_from_prior(found(STRAINED_PRIOR_STDS + 1), None, [CAUSE])  # type: ignore[arg-type]
     assert begun[0].point.tolist() == [0.0, 1.5]
-    assert (again is None) == (ends > OFTEN)
+    assert (again is None) == (ends > STRAINED_PRIOR_STDS)
     assert len(asked) == (1 if again is None else 2)  # what is not kept is asked about no others
     assert asked[0] == []
 
@@ -58,9 +59,9 @@ def test_causes_that_are_known_stay_where_others_are_tried_from_the_data_sheet(m
         asked.append(model)
         raise SimulationDiverged("x", got="nan", expected="numbers")
 
-    monkeypatch.setattr(prior_restarts, "gather", gather)
+    monkeypatch.setattr(prior_restarts, "linearise", gather)
     with pytest.raises(SimulationDiverged):
-        prior_restarts.propose_from_prior(found(OFTEN + 1), None, [], 4)  # type: ignore[arg-type]
+        prior_restarts.propose_from_prior(found(STRAINED_PRIOR_STDS + 1), None, [], 4)  # type: ignore[arg-type]
     assert asked[0].point.tolist() == [0.0, 1.5]
 
 
@@ -68,8 +69,8 @@ def test_where_the_data_sheet_is_no_world_nothing_begins_there(monkeypatch):
     def diverges(*_):
         raise SimulationDiverged("x", got="nan", expected="numbers")
 
-    monkeypatch.setattr(prior_restarts, "approach", diverges)
-    assert refit_from_prior(found(OFTEN + 1), None, [CAUSE]) is None  # type: ignore[arg-type]
+    monkeypatch.setattr(prior_restarts, "quadratic_warm_start", diverges)
+    assert refit_from_prior(found(STRAINED_PRIOR_STDS + 1), None, [CAUSE]) is None  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize(
@@ -91,15 +92,17 @@ def test_causes_with_which_positions_are_hardly_better_predicted_are_none(
     one = found(0.1)
     whole = SimpleNamespace(before=1e-3, after=after, explained=explained, mended=(4e-4, pulls))
     row = SimpleNamespace(hypothesis=CAUSE)
-    first = AcceptedCause(Candidate(row, one, None, None, set(), 0.0, restores_prior=relieves), None, [], [], [], one, None)  # type: ignore[arg-type]
+    first = AcceptedCause(
+        Candidate(row, one, None, None, set(), 0.0, restores_prior=relieves), None, [], [], [], one, None
+    )  # type: ignore[arg-type]
     monkeypatch.setattr(search, "fit", lambda *_, **__: one)
     monkeypatch.setattr(search, "screen", lambda f: [])
-    monkeypatch.setattr(search, "one_step", lambda *_: None)
-    monkeypatch.setattr(search, "pruned", lambda current, steps, *_: (current, steps))
-    monkeypatch.setattr(search, "mended", lambda *_: 1.0)
-    monkeypatch.setattr(search, "is_lacking", lambda *_: lacking)
-    monkeypatch.setattr(search, "_still", lambda start, current, setting, _: (start, current, setting))
-    monkeypatch.setattr(search, "_of_all", lambda *_: whole)
+    monkeypatch.setattr(search, "evaluate_candidates", lambda *_: None)
+    monkeypatch.setattr(search, "drop_redundant", lambda current, steps, *_: (current, steps))
+    monkeypatch.setattr(search, "fraction_explained", lambda *_: 1.0)
+    monkeypatch.setattr(search, "has_lack_of_fit", lambda *_: lacking)
+    monkeypatch.setattr(search, "_drop_new_bifurcations", lambda start, current, setting, _: (start, current, setting))
+    monkeypatch.setattr(search, "_compute_total_gain", lambda *_: whole)
     _, steps, _ = search._chain(one, SimpleNamespace(names=["a"]), [CAUSE], lambda _: None, 4, first)  # type: ignore[arg-type]
     assert steps == ([first] if kept else [])
 
@@ -107,26 +110,30 @@ def test_causes_with_which_positions_are_hardly_better_predicted_are_none(
 @pytest.mark.parametrize("better", [True, False])
 def test_the_next_cause_is_looked_for_from_both_or_from_the_better_one(monkeypatch, better):
     """The first step ends strained; the second sees the causes of both fits, or those of the new one alone."""
-    strained, anew = found(OFTEN + 1), found(0.2)
+    strained, anew = found(STRAINED_PRIOR_STDS + 1), found(0.2)
     looked, row = [], SimpleNamespace(hypothesis=CAUSE)
     first = AcceptedCause(Candidate(row, strained, None, None, set(), 0.0), None, [], [], [], strained, None)  # type: ignore[arg-type]
-    monkeypatch.setattr(search, "resettled", lambda *_: anew)
+    monkeypatch.setattr(search, "refit_from_prior", lambda *_: anew)
     monkeypatch.setattr(search, "fit", lambda *_, **__: strained)
-    monkeypatch.setattr(search, "predicts_better", lambda *_: 1.0 if better else -1.0)
+    monkeypatch.setattr(search, "predictive_gain", lambda *_: 1.0 if better else -1.0)
     monkeypatch.setattr(search, "screen", lambda f: [f])
-    monkeypatch.setattr(search, "begun_with", lambda f, screened, tried, after=0: [(row, f.model)])
-    monkeypatch.setattr(search, "one_step", lambda current, setting, begun, *_: looked.append((current, begun)))
-    monkeypatch.setattr(search, "pruned", lambda current, steps, *_: (current, steps))
-    monkeypatch.setattr(search, "mended", lambda *_: 1.0)
-    monkeypatch.setattr(search, "is_lacking", lambda *_: False)
-    monkeypatch.setattr(search, "_of_all", lambda *_: SimpleNamespace(before=1.0, after=0.5, explained=0.75))
+    monkeypatch.setattr(search, "propose_candidates", lambda f, screened, tried, after=0: [(row, f.model)])
+    monkeypatch.setattr(
+        search, "evaluate_candidates", lambda current, setting, begun, *_: looked.append((current, begun))
+    )
+    monkeypatch.setattr(search, "drop_redundant", lambda current, steps, *_: (current, steps))
+    monkeypatch.setattr(search, "fraction_explained", lambda *_: 1.0)
+    monkeypatch.setattr(search, "has_lack_of_fit", lambda *_: False)
+    monkeypatch.setattr(
+        search, "_compute_total_gain", lambda *_: SimpleNamespace(before=1.0, after=0.5, explained=0.75)
+    )
     end, _, _ = search._chain(strained, SimpleNamespace(names=["a"]), [CAUSE], lambda _: None, 4, first)  # type: ignore[arg-type]
     ((current, begun),) = looked
     assert current is end is (anew if better else strained)
     assert [model for _, model in begun] == ([anew.model] if better else [strained.model, anew.model])
 
 
-@pytest.mark.parametrize("ahead", [0.0, search.FAR + 1])
+@pytest.mark.parametrize("ahead", [0.0, CRITERIA.search.min_refit_gain + 1])
 def test_causes_are_doubted_again_where_all_are_fitted_on(monkeypatch, ahead):
     """A fit that still has far to go may take back what a cause was accepted for."""
     far, near = replace(found(0.1), ahead=ahead), found(0.1)
@@ -135,12 +142,16 @@ def test_causes_are_doubted_again_where_all_are_fitted_on(monkeypatch, ahead):
     doubted, fits = [], iter([far, far, near, near])  # fitted, then asked about the other causes
     monkeypatch.setattr(search, "fit", lambda *_, **__: next(fits))
     monkeypatch.setattr(search, "screen", lambda f: [])
-    monkeypatch.setattr(search, "begun_with", lambda *_, **__: [])
-    monkeypatch.setattr(search, "one_step", lambda *_: None)
-    monkeypatch.setattr(search, "pruned", lambda current, steps, *_: (doubted.append(current) or current, steps))
-    monkeypatch.setattr(search, "mended", lambda *_: 1.0)
-    monkeypatch.setattr(search, "is_lacking", lambda *_: False)
-    monkeypatch.setattr(search, "_of_all", lambda *_: SimpleNamespace(before=1.0, after=0.5, explained=0.75))
+    monkeypatch.setattr(search, "propose_candidates", lambda *_, **__: [])
+    monkeypatch.setattr(search, "evaluate_candidates", lambda *_: None)
+    monkeypatch.setattr(
+        search, "drop_redundant", lambda current, steps, *_: (doubted.append(current) or current, steps)
+    )
+    monkeypatch.setattr(search, "fraction_explained", lambda *_: 1.0)
+    monkeypatch.setattr(search, "has_lack_of_fit", lambda *_: False)
+    monkeypatch.setattr(
+        search, "_compute_total_gain", lambda *_: SimpleNamespace(before=1.0, after=0.5, explained=0.75)
+    )
     end, _, _ = search._chain(far, SimpleNamespace(names=["a"]), [CAUSE], lambda _: None, 4, first)  # type: ignore[arg-type]
     assert doubted == ([far, near] if ahead else [far])
     assert end is doubted[-1]
@@ -163,22 +174,22 @@ def test_where_nothing_is_lacking_a_cause_from_the_data_sheet_must_surely_gain(
     start, tried = found(0.1), []
     gain = SimpleNamespace(least=surely)
     first = AcceptedCause(Candidate(None, start, None, gain, set(), 0.0), None, [], [], [], start, None)  # type: ignore[arg-type]
-    monkeypatch.setattr(search, "is_lacking", lambda *_: lacking)
+    monkeypatch.setattr(search, "has_lack_of_fit", lambda *_: lacking)
     monkeypatch.setattr(search, "screen", lambda f: [])
     monkeypatch.setattr(search, "afresh", lambda *a: tried.append(a[-1]) or [])
-    monkeypatch.setattr(search, "one_step", lambda *_: first)
+    monkeypatch.setattr(search, "evaluate_candidates", lambda *_: first)
     monkeypatch.setattr(search, "_chain", lambda *a: (start, [a[-1]], None))
     _, steps, _ = search._anew(start, SimpleNamespace(names=[*motions]), [CAUSE], lambda _: None)  # type: ignore[arg-type]
     assert steps == ([first] if named else [])
-    assert tried == ([] if motions == "aab" else [0.0 if lacking else search.MUCH])
+    assert tried == ([] if motions == "aab" else [0.0 if lacking else CRITERIA.screening.min_expected_gain])
 
 
 @pytest.mark.parametrize(("least", "tried"), [(0.0, ["much", "half"]), (5.0, ["much"]), (20.0, [])])
 def test_little_is_not_tried_from_the_data_sheet(monkeypatch, least, tried):
     promised = [(10.0, "much", None), (5.0, "half", None), (1.0, "little", None)]
     causes = [toys.hypothesis(name, 2.0) for _, name, _ in promised]
-    monkeypatch.setattr(prior_restarts, "gather", lambda *_: found(0.0).linearisation)
-    monkeypatch.setattr(prior_restarts, "asked_about", lambda here, *_: here)
+    monkeypatch.setattr(prior_restarts, "linearise", lambda *_: found(0.0).linearisation)
+    monkeypatch.setattr(prior_restarts, "linearise_hypotheses", lambda here, *_: here)
     monkeypatch.setattr(prior_restarts, "_promises", lambda _: promised)
     monkeypatch.setattr(prior_restarts, "WORTH_TRYING", 0.4)
     monkeypatch.setattr(prior_restarts, "with_cause", lambda _, h: h)
@@ -198,8 +209,8 @@ def test_little_is_not_tried_from_the_data_sheet(monkeypatch, least, tried):
 )
 def test_what_one_motion_alone_tells_must_surely_gain(monkeypatch, motions, alone, surely, useful):
     """No other motion has predicted it; of two, the other one tells little of what is usual."""
-    monkeypatch.setattr(candidates, "worth_naming", lambda *_: True)
-    monkeypatch.setattr(candidates, "known", lambda *_: True)
+    monkeypatch.setattr(candidates, "is_improvement", lambda *_: True)
+    monkeypatch.setattr(candidates, "accept", lambda *_: True)
     gain, row = SimpleNamespace(least=surely), SimpleNamespace(hypothesis=CAUSE)
     predicted = SimpleNamespace(episode=torch.arange(len(motions)))
     found = Candidate(row, None, predicted, gain, alone, 2.0)  # type: ignore[arg-type]
@@ -254,12 +265,12 @@ def test_what_a_model_has_is_not_asked_about_again(monkeypatch):
         asked.extend(h.name for h in hypotheses)
         raise Enough
 
-    monkeypatch.setattr(search, "approach", lambda model, *_: (model, None))
+    monkeypatch.setattr(search, "quadratic_warm_start", lambda model, *_: (model, None))
     monkeypatch.setattr(search, "fit", base_fit)
     model = toys.fitted(toys.evidence(toys.smooth(1, 2), 1, [], torch.tensor([0.4]).double(), 0)).model
     other = toys.hypothesis("another")
     with pytest.raises(Enough):
-        search.search(model.plus(CAUSE, 1.0), None, [CAUSE, other])  # type: ignore[arg-type]
+        search.search(model.with_hypothesis(CAUSE, 1.0), None, [CAUSE, other])  # type: ignore[arg-type]
     assert asked == ["another"]
 
 
@@ -286,12 +297,14 @@ def test_cells_that_jump_with_a_cause_are_left_out_where_nothing_else_is_lacking
     monkeypatch.setattr(search, "fit", lambda model, setting, *_, **__: search.drop_bins(whole, setting.unstable))
     monkeypatch.setattr(search, "unstable", lambda *_: second)
     less = lambda f: len(whole.linearisation.bins[0].key) - len(f.evidence.cells[0].key)  # noqa: E731
-    monkeypatch.setattr(search, "is_lacking", lambda f, _: less(f) in lacking)
+    monkeypatch.setattr(search, "has_lack_of_fit", lambda f, _: less(f) in lacking)
     monkeypatch.setattr(search, "screen", lambda f: [])
-    monkeypatch.setattr(search, "one_step", lambda *_: None)
-    monkeypatch.setattr(search, "pruned", lambda current, steps, *_: (current, steps))
-    monkeypatch.setattr(search, "mended", lambda *_: float(kept))
-    monkeypatch.setattr(search, "_of_all", lambda *_: SimpleNamespace(before=1.0, after=0.5, explained=0.75))
+    monkeypatch.setattr(search, "evaluate_candidates", lambda *_: None)
+    monkeypatch.setattr(search, "drop_redundant", lambda current, steps, *_: (current, steps))
+    monkeypatch.setattr(search, "fraction_explained", lambda *_: float(kept))
+    monkeypatch.setattr(
+        search, "_compute_total_gain", lambda *_: SimpleNamespace(before=1.0, after=0.5, explained=0.75)
+    )
     asked = Asked(["a"] * toys.EPISODES, first)
     found = search._chain(start, asked, [], lambda _: None, 4, step)  # type: ignore[arg-type]
     assert found.accepted == ([step] if kept else [])

@@ -4,7 +4,8 @@ from types import SimpleNamespace
 
 import pytest
 
-from torchcloth.diagnosis.report.wording import RIPPLED, write_sentences, collect_warnings
+from torchcloth.diagnosis.decide.criteria import CRITERIA
+from torchcloth.diagnosis.report.wording import collect_warnings, write_sentences
 
 LISTS = ("causes", "given", "minor", "ruled_out", "wrong_sign", "undecided", "unresolvable", "lack_of_fit", "drifts")
 LISTS = (*LISTS, "warnings")
@@ -27,7 +28,10 @@ def test_what_is_minor_is_said_with_what_it_cannot_be_told_from():
 
 def test_without_forces_mass_is_said_to_be_unknown():
     def told(*kinds, **content):
-        rows = [{"motion": "swing", "kind": kind, "ratio": 1.0, "lacking": False, "worst": None} for kind in kinds]
+        rows = [
+            {"motion": "swing", "kind": kind, "ratio": 1.0, "is_significant": False, "worst_window": None}
+            for kind in kinds
+        ]
         return any("mass itself cannot be told" in line for line in summary("adequate", lack_of_fit=rows, **content))
 
     assert told("points", "edges")
@@ -59,15 +63,21 @@ def test_what_the_arms_can_do_is_said_with_the_next_experiment(arms, said):
 @pytest.mark.parametrize("weights", [0.5, 70.0])
 def test_a_force_that_nothing_has_is_doubted(weights):
     where = {"at": [0.1, 0.2], "from": 1.0, "to": 1.2}
-    m = {"motion": "swing", "sure": True, "pressure": [0.0, 0.0, 3.0 * weights], "until": None, **where}
+    m = {
+        "motion": "swing",
+        "is_significant": True,
+        "pressure": [0.0, 0.0, 3.0 * weights],
+        "unstable_from": None,
+        **where,
+    }
     (line,) = (text for text in summary("unexplained", missing_force={"weight": 3.0, "motions": [m]}) if "Pa" in text)
     assert f"{100 * weights:.0f} % of the cloth's own weight" in line
     assert ("Hardly anything pushes so much" in line) is (weights > 10)
 
 
 def test_drifts_are_told_with_what_would_tell_more():
-    x = {"axis": "x", "rate": 0.001, "std": 0.004, "p": 1.0, "lacking": False}
-    z = {"axis": "z", "rate": -0.0196, "std": 0.0041, "p": 6e-6, "lacking": True}
+    x = {"axis": "x", "rate": 0.001, "std": 0.004, "p": 1.0, "is_significant": False}
+    z = {"axis": "z", "rate": -0.0196, "std": 0.0041, "p": 6e-6, "is_significant": True}
     (line,) = (line for line in summary("unexplained", drifts=[x, z]) if "drift" in line)
     assert line.startswith(
         "The force on each gripper along z drifts from the simulation's by -20 mN/s (standard error 4)"
@@ -87,7 +97,7 @@ def test_a_law_is_told_though_nothing_else_is_lacking():
 def test_what_lacks_in_one_stretch_of_time_only_is_said_to():
     def told(elsewhere):
         worst = {"from": 1.4, "to": 1.6, "ratio_elsewhere": elsewhere}
-        row = {"motion": "swing", "kind": "points", "ratio": 6.5, "lacking": True, "worst": worst}
+        row = {"motion": "swing", "kind": "points", "ratio": 6.5, "is_significant": True, "worst_window": worst}
         return summary("unexplained", lack_of_fit=[row], drifts=[], missing_force=None, residual=None)
 
     assert "Lacking: points of swing (6.5 times what is expected, 1.2 but for 1.4 to 1.6 s)." in told(1.2)
@@ -96,7 +106,7 @@ def test_what_lacks_in_one_stretch_of_time_only_is_said_to():
 
 def test_numbers_without_a_unit_have_none():
     cause = {"effect": "air.drag_n", "amplitude": 1.19, "unit": "-", "ci95": [1.05, 1.32], "typical": 1.2}
-    cause |= {"says": "", "class": [], "rivals": [], "motions_disagree": False}
+    cause |= {"description": "", "equivalence_class": [], "rivals": [], "motions_disagree": False}
     cause |= {
         "when": {"episode": 0, "motion": "swing", "from": 0.4, "to": 0.6},
         "moves": {"value": 0.0123, "unit": "m"},
@@ -108,12 +118,12 @@ def test_numbers_without_a_unit_have_none():
     beyond = "beyond what fitted numbers could do instead"
     assert f"  Surest in swing from 0.4 to 0.6 s, at (100, 250) mm of the pattern: 12.3 mm {beyond}." in said
     rival = {"effect": "air.wind[x]", "amplitude": 0.4, "unit": "m/s"}
-    open_ = cause | {"says": "It pushes.", "class": ["air.drag_n", "air.linear"], "rivals": [rival]}
+    open_ = cause | {"description": "It pushes.", "equivalence_class": ["air.drag_n", "air.linear"], "rivals": [rival]}
     said = summary("ambiguous", causes=[open_], motions=["swing"])
     assert "  It pushes." in said
     assert "  Cannot be told from: air.linear, air.wind[x] = 0.4 m/s in its place." in said
     assert any("the extended model, which has the one that is named" in line for line in said)
-    felt = cause | {"where": {"gripper": "left"}, "moves": {"value": 0.035, "unit": "N"}}
+    felt = cause | {"where": {"gripper": "left"}, "response": {"value": 0.035, "unit": "N"}}
     said = summary("identified", causes=[felt], motions=["swing"])
     assert f"  Surest in swing from 0.4 to 0.6 s, in what gripper left feels: 35 mN {beyond}." in said
 
@@ -129,7 +139,7 @@ def test_a_cause_whose_interval_holds_zero_says_what_is_known_of_its_size(low):
         "told_by": 1.96,
         "motions_disagree": False,
     }
-    cause |= {"when": {"episode": 0, "from": 0.4, "to": 0.6}, "moves": {"value": 0.035, "unit": "N"}}
+    cause |= {"when": {"episode": 0, "from": 0.4, "to": 0.6}, "response": {"value": 0.035, "unit": "N"}}
     said = summary("identified", causes=[cause | {"where": {"gripper": "left"}}], motions=["stretch"])
     told = [line for line in said if "2.0 motions' worth" in line and "would be 12.4 to 14.6" in line]
     assert bool(told) == (low < 0)
@@ -169,15 +179,22 @@ def test_the_gain_is_told_with_its_intervals():
 
 
 def test_a_missing_force_is_a_pressure_at_a_place():
-    part = {"motion": "swing", "at": [0.1, 0.2], "from": 0.2, "to": 0.4, "pressure": [0.0, 3.0, 4.0], "sure": True}
-    part["until"] = None
+    part = {
+        "motion": "swing",
+        "at": [0.1, 0.2],
+        "from": 0.2,
+        "to": 0.4,
+        "pressure": [0.0, 3.0, 4.0],
+        "is_significant": True,
+    }
+    part["unstable_from"] = None
     (line,) = (t for t in summary("unexplained", missing_force={"weight": 2.0, "motions": [part]}) if "missing" in t)
     assert (
         "A pressure of 5 Pa (250 % of the cloth's own weight) towards (0.0, 0.6, 0.8) of the world is missing" in line
     )
     assert "in swing, about (100, 200) mm" in line
     until = summary(
-        "unexplained", missing_force={"weight": 2.0, "motions": [part, part | {"motion": "hang", "until": 0.6}]}
+        "unexplained", missing_force={"weight": 2.0, "motions": [part, part | {"motion": "hang", "unstable_from": 0.6}]}
     )
     assert (
         "  What force is missing there cannot be asked: small pushes grow without end in hang from 0.6 s on." in until
@@ -196,7 +213,7 @@ def test_ripples_that_would_hide_a_lack_of_fit_are_warned_of():
         row = SimpleNamespace(motion="turn", kind="points", seen=True, stable=stable, lacking=False, expected=expected)
         return [text for text in collect_warnings(found, ["turn"] * 8, [row]) if "ripples" in text]  # type: ignore[arg-type]
 
-    (text,) = warned(1.5 * RIPPLED)
+    (text,) = warned(1.5 * CRITERIA.report.max_expected_rms_m)
     assert "in turn that a right model might leave 15 mm of points" in text
-    assert warned(0.5 * RIPPLED) == []
-    assert warned(1.5 * RIPPLED, stable=False) == []  # said of the meshes already
+    assert warned(0.5 * CRITERIA.report.max_expected_rms_m) == []
+    assert warned(1.5 * CRITERIA.report.max_expected_rms_m, stable=False) == []  # said of the meshes already

@@ -7,10 +7,16 @@ import pytest
 from helpers import sheet_episodes
 
 from torchcloth import effects
-from torchcloth.diagnosis.causes.hypotheses import Hypothesis, catalogue, forget, own_among, register
-from torchcloth.diagnosis.causes.user_hypothesis_checks import check_own
+from torchcloth.diagnosis.causes.hypotheses import (
+    Hypothesis,
+    list_hypotheses,
+    register,
+    select_user_hypotheses,
+    unregister,
+)
+from torchcloth.diagnosis.causes.user_hypothesis_checks import check_user_hypotheses
 from torchcloth.diagnosis.data.dataset import prepare_data
-from torchcloth.diagnosis.models.base_model import base_model
+from torchcloth.diagnosis.models.base_model import build_base_model
 from torchcloth.errors import InvalidInput
 
 
@@ -21,16 +27,16 @@ def fails(*_):
 WRONG = {
     "nothing": (lambda w, a: None, "TypeError: apply gives NoneType, no World"),
     "divides": (fails, "ZeroDivisionError: division by zero in .*test_tried_causes.py, line"),
-    "a motion": (lambda w, a: w.with_motion(fails), "ZeroDivisionError: .*test_tried_causes.py, line"),
-    "a view": (lambda w, a: w.with_view(fails), "ZeroDivisionError: .*test_tried_causes.py, line"),
+    "a motion": (lambda w, a: w.with_motion_transform(fails), "ZeroDivisionError: .*test_tried_causes.py, line"),
+    "a view": (lambda w, a: w.with_observation_transform(fails), "ZeroDivisionError: .*test_tried_causes.py, line"),
     "a view of one episode": (
-        lambda w, a: w.with_view(
+        lambda w, a: w.with_observation_transform(
             lambda frames, e: fails() if float(e.motion["left"].pose[3, 1, 3]) > 0.005 else frames
         ),
         "ZeroDivisionError: .*test_tried_causes.py, line",
     ),
     "no numbers": (
-        lambda w, a: w.with_view(lambda frames, e: frames._replace(x=frames.x * math.nan)),
+        lambda w, a: w.with_observation_transform(lambda frames, e: frames._replace(x=frames.x * math.nan)),
         "frames that are no numbers",
     ),
     "a factor": (
@@ -43,7 +49,7 @@ WRONG = {
 @pytest.fixture
 def world():
     recordings = [sheet_episodes.episode(motion) for motion in ("slow", "fast")]
-    model = base_model(recordings[0])
+    model = build_base_model(recordings[0])
     return recordings, model, prepare_data(model, recordings)
 
 
@@ -53,14 +59,14 @@ def test_a_cause_of_ones_own_is_tried(world, case):
     apply, said = WRONG[case]
     own = Hypothesis("my.own", "-", 1.0, apply)
     with pytest.raises(InvalidInput, match=f"hypothesis 'my.own'; got .*{said}"):
-        check_own([own], model.base, setting.episodes)
+        check_user_hypotheses([own], model.base, setting.episodes)
 
 
 def test_what_fails_at_some_amplitudes_only_is_no_world_there(world):
     """The first frames with a typical amplitude are fine; a search may come to others."""
     _, model, _ = world
     own = Hypothesis("my.root", "-", 1.0, lambda w, a: w if math.sqrt(a) < 2 else None, signed=True)  # type: ignore[arg-type]
-    assert isinstance(own.applied(model.base, 1.0), type(model.base))
+    assert isinstance(own.apply_to(model.base, 1.0), type(model.base))
     for amplitude, said in ((-1.0, "ValueError"), (9.0, "no World")):
         with pytest.raises(InvalidInput, match=f"hypothesis 'my.root'; got .*{said}"):
             model.plus(own, amplitude).world()
@@ -68,16 +74,16 @@ def test_what_fails_at_some_amplitudes_only_is_no_world_there(world):
 
 def test_what_is_given_and_not_registered_is_ones_own_as_well(world):
     recordings, model, _ = world
-    known, own = catalogue(model, recordings), Hypothesis("my.own", "-", 1.0, lambda w, a: w)
-    assert own_among([*known, own]) == [own]
+    known, own = list_hypotheses(model, recordings), Hypothesis("my.own", "-", 1.0, lambda w, a: w)
+    assert select_user_hypotheses([*known, own]) == [own]
     for wrong, said in (([own, own], "'my.own' twice"), ([replace(own, typical=0.0)], "typical of 'my.own'; got 0")):
         with pytest.raises(InvalidInput, match=said):
-            own_among(wrong)
+            select_user_hypotheses(wrong)
 
 
 def test_a_right_one_passes(world):
     _, model, setting = world
-    check_own(
+    check_user_hypotheses(
         [Hypothesis("my.own", "1/s", 1.0, lambda w, a: w.with_cloth({"mine": effects.MassDamping(a)}))],
         model.base,
         setting.episodes,
@@ -94,9 +100,9 @@ def test_no_effect_may_take_the_place_of_the_catalogues(world):
         register(Hypothesis("my.own", "1/s", 1.0, lambda w, a, own=Mine, key=name: w.with_cloth({key: own(a)})))
         try:
             with pytest.raises(InvalidInput, match=f"named '{name}', as the catalogue calls one of its own"):
-                catalogue(model, recordings)
+                list_hypotheses(model, recordings)
         finally:
-            forget("my.own")
+            unregister("my.own")
 
 
 @pytest.mark.parametrize(
@@ -122,11 +128,11 @@ def test_a_signed_cause_is_tried_both_ways(world):
     braked = lambda w, a: w.with_cloth({"my": effects.MassDamping(math.sqrt(1 + 2 * a) - 1 if a else 0.0)})  # noqa: E731
     own = Hypothesis("my.own", "-", 0.8, braked, signed=True)
     with pytest.raises(InvalidInput, match=r"hypothesis 'my.own'; got ValueError"):
-        check_own([own], model.base, setting.episodes)
-    ends = replace(own, low=0.0)
-    assert not ends.reverses
-    check_own([ends], model.base, setting.episodes)
-    assert replace(own, low=-0.3).opposite.typical == -0.3
+        check_user_hypotheses([own], model.base, setting.episodes)
+    ends = replace(own, min_amplitude=0.0)
+    assert not ends.is_reversible
+    check_user_hypotheses([ends], model.base, setting.episodes)
+    assert replace(own, min_amplitude=-0.3).opposite.typical == -0.3
 
 
 def test_a_way_that_no_world_has_hides_nothing_of_the_other(world):
@@ -135,4 +141,4 @@ def test_a_way_that_no_world_has_hides_nothing_of_the_other(world):
     apply, said = WRONG["a factor"]
     for signed in (False, True):
         with pytest.raises(InvalidInput, match=said):
-            check_own([Hypothesis("my.own", "-", 2.0, apply, signed=signed)], model.base, setting.episodes)
+            check_user_hypotheses([Hypothesis("my.own", "-", 2.0, apply, signed=signed)], model.base, setting.episodes)

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import torch
 
-from torchcloth.diagnosis.data.binning import NAMES, Cells
-from torchcloth.diagnosis.inference.fitting import Fitted
-from torchcloth.diagnosis.inference.linearise import Evidence
-from torchcloth.diagnosis.inference.noise import Noise, whitened
-from torchcloth.episodes.world import Hypothesis, Model, Parameter
+from torchcloth.diagnosis.data.binning import BLOCK_NAMES, BinnedResiduals
+from torchcloth.diagnosis.inference.fitting import ModelFit
+from torchcloth.diagnosis.inference.linearise import Linearisation
+from torchcloth.diagnosis.inference.noise import Noise, whiten
+from torchcloth.episodes.world import BaseParameter, Hypothesis, WorldModel
 
 EPISODES, PATCHES, WINDOWS = 4, 16, 6
 WHITE, SLOW, STD = 2e-4, 8e-4, 1.5e-3  # m
@@ -18,17 +18,17 @@ def hypothesis(name: str, typical: float = 1.0, **options) -> Hypothesis:
     return Hypothesis(name, "-", typical, lambda world, _: world, signed=True, **options)
 
 
-def parameter(name: str, std: float = 0.5) -> Parameter:
-    return Parameter(name, "-", 0.1, std, lambda world, _: world, lambda x: x)
+def parameter(name: str, std: float = 0.5) -> BaseParameter:
+    return BaseParameter(name, "-", 0.1, std, lambda world, _: world, lambda x: x)
 
 
-def grid() -> Cells:
+def grid() -> BinnedResiduals:
     """One episode's cells without values: a square of 0.3 m in 4 x 4 parts."""
     patch, window = (i.flatten() for i in torch.meshgrid(torch.arange(PATCHES), torch.arange(WINDOWS), indexing="ij"))
     place = torch.stack([(patch // 4) * 0.075, (patch % 4) * 0.075, torch.full(patch.shape, 0.01)], 1).double()
     size = len(patch)
     one = torch.ones(size).double()
-    return Cells(
+    return BinnedResiduals(
         torch.zeros(size).double(), torch.zeros(size, 0).double(), 25 * one, 5 * WHITE * one,
         torch.zeros(size).long(), 3 * patch, window, place, 0.2 * window.double(),
         torch.zeros(size).double(), torch.zeros(size).double(),
@@ -39,16 +39,16 @@ def smooth(seed: int, columns: int) -> torch.Tensor:
     """[EPISODES, C, columns] m per unit, slopes that vary over centimetres and tenths of a second."""
     rng = torch.Generator().manual_seed(seed)
     cells = grid()
-    basis = torch.cat([cells.place[:, :2] / 0.3, cells.time[:, None]], 1)
+    basis = torch.cat([cells.rest_position[:, :2] / 0.3, cells.time[:, None]], 1)
     waves = torch.randn(EPISODES, 3, columns, generator=rng).double() * 3
     shift = 6.3 * torch.rand(EPISODES, 1, columns, generator=rng).double()
     return 5e-3 * torch.sin(basis @ waves + shift)
 
 
-def evidence(slopes: torch.Tensor, own: int, names: list[str], truth: torch.Tensor, seed: int) -> Evidence:
+def evidence(slopes: torch.Tensor, own: int, names: list[str], truth: torch.Tensor, seed: int) -> Linearisation:
     """Residuals of a world in which ``truth`` [own + names] is what the model lacks; last column: a nuisance."""
     rng = torch.Generator().manual_seed(1000 + seed)
-    level = torch.zeros(len(NAMES)).double()
+    level = torch.zeros(len(BLOCK_NAMES)).double()
     level[0] = SLOW
     cells, stds = [], []
     for own_slopes in slopes:
@@ -58,14 +58,16 @@ def evidence(slopes: torch.Tensor, own: int, names: list[str], truth: torch.Tens
         cells.append(blank._replace(value=noise - own_slopes[:, :-1] @ truth))
         stds.append(torch.tensor([STD]).double())
     found = [hypothesis(name) for name in names]
-    return Evidence(cells, own, found, stds, [torch.zeros_like(c.value) for c in cells])
+    return Linearisation(cells, own, found, stds, [torch.zeros_like(c.value) for c in cells])
 
 
-def fitted(ev: Evidence, level: float = SLOW, std: float = 0.5) -> Fitted:
+def fitted(ev: Linearisation, level: float = SLOW, std: float = 0.5) -> ModelFit:
     """As ``fit`` leaves it, at the point where the evidence was gathered."""
-    levels = torch.full((len(NAMES),), level).double()
-    model = Model(None, tuple(parameter(f"p{k}", std) for k in range(ev.own)), torch.zeros(ev.own).double())  # type: ignore[arg-type]
-    white = whitened(ev, Noise(levels))
-    own = white.jacobian[:, : ev.own]
-    covariance = torch.linalg.inv(own.mT @ own + torch.eye(ev.own).double() / std**2)
-    return Fitted(model, ev, Noise(levels), white, covariance, 0.0)
+    levels = torch.full((len(BLOCK_NAMES),), level).double()
+    model = WorldModel(
+        None, tuple(parameter(f"p{k}", std) for k in range(ev.n_coordinates)), torch.zeros(ev.n_coordinates).double()
+    )  # type: ignore[arg-type]
+    white = whiten(ev, Noise(levels))
+    own = white.jacobian[:, : ev.n_coordinates]
+    covariance = torch.linalg.inv(own.mT @ own + torch.eye(ev.n_coordinates).double() / std**2)
+    return ModelFit(model, ev, Noise(levels), white, covariance, 0.0)
