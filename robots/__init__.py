@@ -1,34 +1,36 @@
-"""Robots: kinematics from URDF as differentiable torch modules, families of motion, and plans for them."""
+"""Robots: kinematics from URDF as differentiable torch modules, families of motion, and joint plans for them."""
 
 if __name__ != "torchcloth.robots":
     raise ImportError(f"got {__name__!r}; import this package as torchcloth.robots")
 
 from . import primitives
-from .arm import Arm, Limits, Primitive, load
-from .description import models
-from .grasp_orientations import Hold
-from .plan import ACCELERATION, Plan, plan
-from .replan_episode import retrace
-from .replay import arm_of, closing, gripper_motion, replay
+from .arm import Arm, Primitive, load
+from .chain import JointLimits, SerialChain
+from .description import list_models
+from .grasp_orientations import GraspOrientation
+from .plan import DEFAULT_JOINT_ACCELERATION, JointPlan, plan
+from .replan_episode import joint_motion_for_episode
+from .replay import arm_from_recording, list_closing_grippers, replay, to_gripper_motion
 from .scene import Scene, Table, bimanual_rig
 
 __all__ = [
-    "ACCELERATION",
+    "DEFAULT_JOINT_ACCELERATION",
     "Arm",
-    "Hold",
-    "Limits",
-    "Plan",
+    "GraspOrientation",
+    "JointLimits",
+    "JointPlan",
     "Primitive",
     "Scene",
+    "SerialChain",
     "Table",
-    "arm_of",
+    "arm_from_recording",
     "bimanual_rig",
-    "closing",
-    "gripper_motion",
+    "joint_motion_for_episode",
+    "list_closing_grippers",
+    "list_models",
     "load",
-    "models",
     "plan",
     "primitives",
     "replay",
-    "retrace",
+    "to_gripper_motion",
 ]

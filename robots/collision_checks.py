@@ -1,4 +1,4 @@
-"""What must stay apart in a scene: arm and arm, arm and table, the links of one arm."""
+"""Checks of the distances between two arms, between an arm and the table, and between the links of one arm."""
 
 from __future__ import annotations
 
@@ -10,51 +10,60 @@ from torch import Tensor
 from torchcloth.errors import InvalidInput
 
 from .arm import Arm
-from .clearance import Gap, Named, nearest
+from .clearance import Gap, NamedSolid, smallest_gap
 from .scene import Scene
-from .spline import Spline
+from .spline import ClampedSpline, subdivide_times
 
-OWN = 0.005  # m, between the links of one arm; the wrist's pass each other at 3 mm when folded up
-STEP = 0.02  # s, between the instants that are looked at
+MIN_LINK_CLEARANCE_M = 0.005  # between links of one arm; the links of a folded wrist pass each other at 3 mm
+COLLISION_CHECK_PERIOD_S = 0.02  # largest time between two checks
 
 
-def within_arm(scene: Scene, name: str, q: Tensor, times: Tensor, clearance: float) -> tuple[Gap, InvalidInput | None]:
-    """The smallest distance of one arm to the table or to itself, and the refusal if one is too small.
+def check_self_and_table(
+    scene: Scene, name: str, q: Tensor, times: Tensor, clearance: float
+) -> tuple[Gap, InvalidInput | None]:
+    """Return the smallest distance of one arm to the table and to itself, and an error if one is too small.
 
     Fingers on the table do not count in the distance: they work there.
 
     Args:
-        scene: the arm is in.
+        scene: contains the arm.
         name: of the arm.
-        q: [T, J] rad, its joint positions at
-        times: [T] s.
-        clearance: to the table [m]; 0 for the solids of the tool's own frame, ``OWN`` among the links.
+        q: [T, J] rad, joint positions.
+        times: [T] s, their times.
+        clearance: m, smallest distance to the table. It is 0 for the solids of the tool's own frame. Between links it
+            is ``MIN_LINK_CLEARANCE_M``.
     """
     arm = scene[name]
-    solids, bodies = _solids(arm, name, q), arm.bodies
-    own = [(i, j) for i, j in combinations(range(len(solids)), 2) if abs(bodies[i] - bodies[j]) > 1]
-    gaps = [(OWN, nearest(solids, own, times))]
+    solids, joints = _named_solids(arm, name, q), arm.solid_joints
+    link_pairs = [(i, j) for i, j in combinations(range(len(solids)), 2) if abs(joints[i] - joints[j]) > 1]
+    gaps = [(MIN_LINK_CLEARANCE_M, smallest_gap(solids, link_pairs, times))]
     if scene.table is not None:
         top = len(solids)
         fingers = [i for i in range(top) if solids[i].primitive.link == arm.frame]
-        others = [i for i in range(top) if i not in fingers and bodies[i] > 0]  # the root may stand on it
-        solids = [*solids, Named("the table", scene.table.primitive())]
-        gaps.append((clearance, nearest(solids, [(i, top) for i in others], times, clearance)))
-        gaps.append((0.0, nearest(solids, [(i, top) for i in fingers], times)))
-    refusals = [gap.refusal(least) for least, gap in gaps if gap.distance < least]
-    closest = min((gap for least, gap in gaps if least > 0), key=lambda gap: gap.distance)
-    return closest, refusals[0] if refusals else None
+        others = [i for i in range(top) if i not in fingers and joints[i] > 0]  # the root may stand on the table
+        solids = [*solids, NamedSolid("the table", scene.table.primitive())]
+        gaps.append((clearance, smallest_gap(solids, [(i, top) for i in others], times, clearance)))
+        gaps.append((0.0, smallest_gap(solids, [(i, top) for i in fingers], times)))
+    errors = [gap.to_error(min_distance) for min_distance, gap in gaps if gap.distance < min_distance]
+    closest = min((gap for min_distance, gap in gaps if min_distance > 0), key=lambda gap: gap.distance)
+    return closest, errors[0] if errors else None
 
 
-def between_arms(scene: Scene, splines: Mapping[str, Spline], clearance: float = 0.0) -> Gap:
-    """The smallest distance of any arm to any other; ``FAR`` or ``clearance`` [m] where all are farther apart."""
-    times = next(iter(splines.values())).finer(STEP)
-    groups = [_solids(scene[name], name, spline.at(times)[0]) for name, spline in splines.items()]
+def check_between_arms(scene: Scene, splines: Mapping[str, ClampedSpline], clearance: float = 0.0) -> Gap:
+    """Return the smallest distance between any two arms.
+
+    Args:
+        scene: contains the arms.
+        splines: joint motions by arm.
+        clearance: m; larger distances than this and ``MAX_RESOLVED_GAP_M`` are not refined.
+    """
+    times = subdivide_times(next(iter(splines.values())).t, COLLISION_CHECK_PERIOD_S)
+    groups = [_named_solids(scene[name], name, spline.positions(times)) for name, spline in splines.items()]
     solids = [solid for group in groups for solid in group]
     owner = [number for number, group in enumerate(groups) for _ in group]
     pairs = [(i, j) for i, j in combinations(range(len(solids)), 2) if owner[i] != owner[j]]
-    return nearest(solids, pairs, times, clearance)
+    return smallest_gap(solids, pairs, times, clearance)
 
 
-def _solids(arm: Arm, name: str, q: Tensor) -> list[Named]:
-    return [Named(f"{p.link} of {name}", p) for p in arm.geometry(q)]
+def _named_solids(arm: Arm, name: str, q: Tensor) -> list[NamedSolid]:
+    return [NamedSolid(f"{p.link} of {name}", p) for p in arm.geometry(q)]

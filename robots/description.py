@@ -1,8 +1,8 @@
-"""From URDF text to the numbers of one serial chain, in float64.
+"""The numbers of one serial chain (float64) from a URDF file.
 
-pytorch-kinematics parses the file. Its ``SerialChain`` is not built on top: that rounds joint origins to float32
-(1e-7 m), lets mimic joints move freely, takes z where URDF's default axis is x, and writes in place, which stops vmap.
-The tests compare the two.
+pytorch-kinematics parses the file. Its ``SerialChain`` is not used: it rounds joint origins to float32 (1e-7 m), lets
+mimic joints move freely, takes z where URDF's default axis is x, and writes in place, which stops vmap. The tests
+compare the two.
 """
 
 from __future__ import annotations
@@ -22,53 +22,84 @@ from torchcloth.errors import InvalidInput, MissingDependency
 from .rigid import origin_matrix
 
 URDF_FOLDER = Path(str(resources.files("torchcloth.robots"))) / "urdf"
-MOVING = ("revolute", "continuous", "prismatic")
+MOVING_JOINT_TYPES = ("revolute", "continuous", "prismatic")
 
 
 class Shape(NamedTuple):
-    """A primitive fixed to a body of the chain."""
+    """A primitive solid that is fixed to a body of the chain.
 
-    kind: str  # "box", "cylinder" or "sphere"
-    size: tuple[float, ...]  # m
+    Attributes:
+        kind: "box", "cylinder" or "sphere".
+        size: m, as in ``arm.Primitive``.
+        link: name of its link.
+        body: 0 is the root; body j moves with joint j, counted from 1.
+        pose: [4, 4] m, in that body.
+    """
+
+    kind: str
+    size: tuple[float, ...]
     link: str
-    body: int  # 0 is the root, j moves with joint j (counted from 1)
-    pose: Tensor  # [4, 4] m, in that body
+    body: int
+    pose: Tensor
 
 
 class Description(NamedTuple):
-    """A serial chain: body j hangs on body j - 1 by ``origin[j - 1]`` and then moves along or about ``axis[j - 1]``."""
+    """A serial chain of J joints.
+
+    Body j hangs on body j - 1 by ``origin[j - 1]`` and then moves along or about ``axis[j - 1]``.
+
+    Attributes:
+        name: of the robot.
+        joint_names: root first.
+        joint_types: ``revolute``, ``continuous`` or ``prismatic``.
+        origin: [J, 4, 4] m.
+        axis: [J, 3], unit vectors in each joint's own frame.
+        tip: [4, 4] m, pose of the end frame in the last body.
+        limits: [6, J], lower, upper, soft lower, soft upper, velocity, effort.
+        shapes: primitive solids.
+        links_without_primitives: links of the chain whose solids are meshes only.
+    """
 
     name: str
     joint_names: tuple[str, ...]
     joint_types: tuple[str, ...]
-    origin: Tensor  # [J, 4, 4] m
-    axis: Tensor  # [J, 3] unit vectors in the joint's own frame
-    tip: Tensor  # [4, 4] m, the frame in the last body
-    limits: Tensor  # [6, J] lower, upper, soft lower, soft upper, velocity, effort
+    origin: Tensor
+    axis: Tensor
+    tip: Tensor
+    limits: Tensor
     shapes: tuple[Shape, ...]
-    unshaped: tuple[str, ...]  # links of the chain whose solids are meshes alone
+    links_without_primitives: tuple[str, ...]
 
 
-def models() -> list[str]:
-    """The names of the arms that come with torchcloth."""
+def list_models() -> list[str]:
+    """List the names of the arms that come with torchcloth."""
     return sorted(path.stem for path in URDF_FOLDER.glob("*.urdf"))
 
 
-def locate(name_or_path: str | Path) -> Path:
-    """The file behind the name of a shipped arm or a path."""
-    if str(name_or_path) in models():
+def locate_urdf(name_or_path: str | Path) -> Path:
+    """Return the URDF file of a shipped arm's name or of a path.
+
+    Raises:
+        InvalidInput: no such arm or file.
+    """
+    if str(name_or_path) in list_models():
         return URDF_FOLDER / f"{name_or_path}.urdf"
     path = Path(name_or_path)
     if path.is_file():
         return path
     if path.suffix or len(path.parts) > 1:
         raise InvalidInput("there is no such URDF file", got=path, remedy="check the path")
-    expected = f"one of {', '.join(models())}, or the path of a URDF file"
+    expected = f"one of {', '.join(list_models())}, or the path of a URDF file"
     raise InvalidInput("unknown robot name_or_path", got=repr(str(name_or_path)), expected=expected)
 
 
-def parse(path: Path) -> Any:
-    """The URDF file as the parser of pytorch-kinematics sees it (all of its numbers are Python floats)."""
+def parse_urdf(path: Path) -> Any:
+    """Parse a URDF file by pytorch-kinematics (all of its numbers are Python floats).
+
+    Raises:
+        MissingDependency: pytorch-kinematics is not installed.
+        InvalidInput: the file cannot be read.
+    """
     try:
         from pytorch_kinematics import URDF
     except ImportError as error:
@@ -82,15 +113,16 @@ def parse(path: Path) -> Any:
         raise InvalidInput(f"{path} is not a URDF file that can be read", got=error, remedy="mend the file") from error
 
 
-def describe(path: Path, frame: str) -> Description:
-    """Reads the chain from the root link to the link ``frame``.
+def read_description(path: Path, frame: str) -> Description:
+    """Read the chain from the root link to the link ``frame``.
 
     Raises:
-        InvalidInput: the file is not URDF, has no such link, or the chain has a joint that is not one free number.
+        InvalidInput: the file is not URDF or has no such link, or a joint of the chain has not exactly one free
+            coordinate.
     """
-    robot = parse(path)
+    robot = parse_urdf(path)
     chain = _joints_to(robot, frame, path)
-    moving = [joint for joint in chain if joint.type in MOVING]
+    moving = [joint for joint in chain if joint.type in MOVING_JOINT_TYPES]
     if not moving:
         raise InvalidInput(f"no joint of {path} moves {frame!r}", remedy="choose a frame at the end of the arm")
 
@@ -99,7 +131,7 @@ def describe(path: Path, frame: str) -> Description:
     shapes += _shapes(robot.link_map[chain[0].parent], 0, pending)
     for joint in chain:
         pending = pending @ _matrix(joint.origin)
-        if joint.type in MOVING:
+        if joint.type in MOVING_JOINT_TYPES:
             origins.append(pending)
             pending = torch.eye(4, dtype=torch.float64)
         shapes += _shapes(robot.link_map[joint.child], len(origins), pending)
@@ -112,12 +144,14 @@ def describe(path: Path, frame: str) -> Description:
         tip=pending,
         limits=torch.tensor([_limits(joint) for joint in moving], dtype=torch.float64).T.contiguous(),
         shapes=tuple(shapes),
-        unshaped=_unshaped([robot.link_map[chain[0].parent], *(robot.link_map[joint.child] for joint in chain)]),
+        links_without_primitives=_links_without_primitives(
+            [robot.link_map[chain[0].parent], *(robot.link_map[joint.child] for joint in chain)]
+        ),
     )
 
 
 def _joints_to(robot: Any, frame: str, path: Path) -> list:
-    """The joints from the root to ``frame``, each one checked."""
+    """Joints from the root to ``frame``, each one checked."""
     if frame not in robot.link_map:
         raise InvalidInput(
             f"{path} has no link for frame", got=repr(frame), expected=f"one of {', '.join(robot.link_map)}"
@@ -132,8 +166,8 @@ def _joints_to(robot: Any, frame: str, path: Path) -> list:
         if joint.mimic is not None:
             remedy = "choose a frame before it, or make the joint fixed"
             raise InvalidInput(f"joint {name!r} mimics {joint.mimic.joint!r}: it is no free joint", remedy=remedy)
-        if joint.type not in (*MOVING, "fixed"):
-            expected = f"{', '.join(MOVING)} or fixed"
+        if joint.type not in (*MOVING_JOINT_TYPES, "fixed"):
+            expected = f"{', '.join(MOVING_JOINT_TYPES)} or fixed"
             raise InvalidInput(f"joint {name!r} on the way to {frame!r}", got=f"type {joint.type!r}", expected=expected)
         chain.insert(0, joint)
     return chain
@@ -157,7 +191,7 @@ def _axis(joint: Any) -> Tensor:
 
 
 def _limits(joint: Any) -> tuple[float, ...]:
-    """Lower, upper, soft lower, soft upper, velocity, effort; infinite where the file is silent, or a velocity is 0."""
+    """Lower, upper, soft lower, soft upper, velocity, effort; infinite if the file gives none, or a velocity of 0."""
     lower, upper, velocity, effort = -math.inf, math.inf, math.inf, math.inf
     if joint.limit is not None:
         velocity, effort = joint.limit.velocity or math.inf, joint.limit.effort  # 0 is "not stated", as in ROS
@@ -178,27 +212,27 @@ def _limits(joint: Any) -> tuple[float, ...]:
 
 
 def _shapes(link: Any, body: int, placed: Tensor) -> list[Shape]:
-    """The primitives of a link: those it collides with, or those that are shown if it collides with none."""
+    """Primitives of a link: its collision shapes, or its visual ones if it has no collision shapes."""
 
     def read(elements: list) -> list[Shape]:
-        found = [(_primitive(element.geometry), element) for element in elements]
-        for primitive, element in found:
+        primitives = [(_primitive(element.geometry), element) for element in elements]
+        for primitive, element in primitives:
             if primitive is not None and not all(0 < size < math.inf for size in primitive[1]):
                 what = f"{primitive[0]} of link {link.name!r}, {element.name!r}" if element.name else link.name
                 raise InvalidInput(f"size of a solid of {what}", got=primitive[1], expected="finite lengths > 0")
         return [
             Shape(*primitive, link.name, body, placed @ _matrix(element.origin))
-            for primitive, element in found
+            for primitive, element in primitives
             if primitive is not None
         ]
 
     return read(link.collisions) or read(link.visuals)
 
 
-def _unshaped(links: list) -> tuple[str, ...]:
-    """Links of which something, that would be in the way, is a mesh."""
+def _links_without_primitives(links: list) -> tuple[str, ...]:
+    """Links with a solid that is a mesh."""
     solids = [(link.name, link.collisions or link.visuals) for link in links]
-    return tuple(name for name, own in solids if any(_primitive(e.geometry) is None for e in own))
+    return tuple(name for name, elements in solids if any(_primitive(e.geometry) is None for e in elements))
 
 
 def _primitive(geometry: Any) -> tuple[str, tuple[float, ...]] | None:

@@ -1,4 +1,4 @@
-"""The joint motions by which one arm can follow a path of its gripper, best first."""
+"""Joint motions by which one arm follows a path of its gripper, best first."""
 
 from __future__ import annotations
 
@@ -13,58 +13,86 @@ from torchcloth.types import Trajectory
 
 from . import trajectories
 from .arm import Arm
-from .collision_checks import STEP
-from .grasp_orientations import ELBOWS, Hold
-from .inverse import Unreachable, solve
-from .spline import Spline
+from .collision_checks import COLLISION_CHECK_PERIOD_S
+from .grasp_orientations import CANDIDATE_ELBOW_OFFSETS_RAD, GraspOrientation
+from .inverse import UnreachablePose, solve_inverse_kinematics
+from .spline import ClampedSpline, subdivide_times
 
-GLANCE = 6  # poses of the path by which all holds are judged first
-LOOK = 24  # and then the best of them, with several postures of the arm
-BEST = 4
-REST = 0.02  # s, between knots of a path that stands still
-QUICK = 30  # iterations for a pose while judging
-FINE = 0.005  # s, between the samples that limits are checked at
-SLACK = 1e-4  # rad or m, by which a spline may pass a soft limit between two knots that keep it
-TRACKING = 1e-4  # m, between the path and where the joints lead
+COARSE_POSES = 6  # poses of the path by which all orientations are ranked first
+FINE_POSES = 24  # poses by which the best of them are ranked again, with several postures of the arm
+MAX_REFINED_ORIENTATIONS = 4
+DWELL_KNOT_PERIOD_S = 0.02  # largest time between knots while the gripper stands still
+COARSE_IK_ITERATIONS = 30  # for a pose while orientations are ranked
+COARSE_IK_TOLERANCE = 1e-6  # m and rad, in one norm
+PATH_IK_ITERATIONS = 100
+PATH_IK_TOLERANCE = 1e-9  # m and rad, in one norm
+LIMIT_CHECK_PERIOD_S = 0.005  # largest time between two checks of the limits
+SOFT_LIMIT_TOLERANCE = 1e-4  # rad or m, by which a spline may exceed a soft limit between two knots within it
+MAX_PATH_ERROR_M = 1e-4  # largest distance of the gripper from its path
 
 
-class Load(NamedTuple):
-    """How hard a joint motion is: the factor of slowing down that one limit asks for, and where it is met."""
+class RequiredSlowdown(NamedTuple):
+    """How much a joint motion must be slowed down to satisfy one limit, and where that limit is met.
+
+    Attributes:
+        factor: of the duration; at most 1 if the limit is satisfied.
+        quantity: "velocity" or "acceleration".
+        joint: its number.
+        time: s.
+        value: rad/s or rad/s^2 (m/s, m/s^2), at that time.
+        limit: in the unit of ``value``.
+    """
 
     factor: float
-    what: str  # "velocity" or "acceleration"
+    quantity: str
     joint: int
-    time: float  # s
-    value: float  # rad/s or rad/s^2 (m/s, m/s^2)
+    time: float
+    value: float
     limit: float
 
 
-class Way(NamedTuple):
-    """One joint motion that follows the path."""
+class JointPath(NamedTuple):
+    """One joint motion that follows the path.
 
-    hold: Hold
-    spline: Spline
-    load: Load
+    Attributes:
+        orientation: of the tool.
+        spline: the joint motion.
+        slowdown: what the limits of velocity and acceleration require.
+    """
+
+    orientation: GraspOrientation
+    spline: ClampedSpline
+    slowdown: RequiredSlowdown
 
 
-Check = Callable[[Tensor, Tensor], InvalidInput | None]  # of joint positions [T, J] at times [T] s: what is in the way
+CollisionCheck = Callable[
+    [Tensor, Tensor], InvalidInput | None
+]  # (joint positions [T, J], times [T] s) -> error or None
 
 
-class Task(NamedTuple):
-    """What one arm has to do."""
+class PathTask(NamedTuple):
+    """The task of one arm.
+
+    Attributes:
+        arm: the kinematics.
+        path: of its gripper.
+        approach: [3], see ``approach_heading``.
+        acceleration: [J] rad/s^2, largest accelerations allowed.
+        check_collisions: returns an error if joint positions [T, J] at times [T] s collide.
+    """
 
     arm: Arm
     path: Trajectory
-    inward: Tensor  # [3], see ``holds.inward``
-    acceleration: Tensor  # [J] rad/s^2, the most allowed
-    check: Check
+    approach: Tensor
+    acceleration: Tensor
+    check_collisions: CollisionCheck
 
 
-def dense(path: Trajectory) -> Trajectory:
-    """The path with more knots where it stands still: a spline rings across knots that are far apart."""
+def densify_dwells(path: Trajectory) -> Trajectory:
+    """Return the path with more knots where it stands still: a spline rings across knots that are far apart."""
     t, pose, closed = path
     still = (pose[1:] == pose[:-1]).all(dim=(-1, -2))
-    counts = torch.where(still, (t.diff() / REST).ceil().long().clamp(min=1), 1)
+    counts = torch.where(still, (t.diff() / DWELL_KNOT_PERIOD_S).ceil().long().clamp(min=1), 1)
     knot = torch.repeat_interleave(torch.arange(len(counts)), counts)
     within = torch.arange(len(knot)) - torch.repeat_interleave(counts.cumsum(0) - counts, counts)
     times = t[knot] + t.diff()[knot] * within / counts[knot]
@@ -72,117 +100,125 @@ def dense(path: Trajectory) -> Trajectory:
     return Trajectory(torch.cat([times, t[-1:]]), pose[knot], closed[knot])
 
 
-def ways(task: Task, holds: Sequence[Hold]) -> Iterator[Hold]:
-    """Holds that can follow the path, about in the order of how little slower than asked they are.
+def rank_orientations(task: PathTask, orientations: Sequence[GraspOrientation]) -> Iterator[GraspOrientation]:
+    """Yield the orientations that can follow the path, roughly in the order of the slowdown that they require.
 
     Raises:
-        InvalidInput: no hold can; names the joints in the way of the one that comes farthest.
+        InvalidInput: no orientation can; names the joints or solids that stop the one that comes farthest.
     """
-    if len(holds) == 1:
-        yield holds[0]
+    if len(orientations) == 1:
+        yield orientations[0]
         return
-    judged, failures = _judge(task, GLANCE, holds)
-    if not judged:
-        raise max(failures, key=lambda failure: failure[0])[1]
-    postures = [hold._replace(elbow=elbow) for hold in judged[:BEST] for elbow in ELBOWS]
-    looked, missed = _judge(task, LOOK, postures)
-    if not looked and not judged[BEST:]:
-        raise max(missed, key=lambda failure: failure[0])[1]
-    yield from looked
-    yield from judged[BEST:]
+    coarse, coarse_failures = _rank(task, COARSE_POSES, orientations)
+    if not coarse:
+        raise max(coarse_failures, key=lambda failure: failure[0])[1]
+    postures = [
+        orientation._replace(elbow_offset=elbow)
+        for orientation in coarse[:MAX_REFINED_ORIENTATIONS]
+        for elbow in CANDIDATE_ELBOW_OFFSETS_RAD
+    ]
+    fine, fine_failures = _rank(task, FINE_POSES, postures)
+    if not fine and not coarse[MAX_REFINED_ORIENTATIONS:]:
+        raise max(fine_failures, key=lambda failure: failure[0])[1]
+    yield from fine
+    yield from coarse[MAX_REFINED_ORIENTATIONS:]
 
 
-def follow(task: Task, hold: Hold) -> Way:
-    """The joint motion through every knot of the path.
+def solve_joint_path(task: PathTask, orientation: GraspOrientation) -> JointPath:
+    """Compute the joint motion through every knot of the path.
 
     Raises:
-        InvalidInput: a pose is out of reach, a soft limit is passed, the joints stray from the path between knots, or
-            something is in the way.
+        InvalidInput: a pose is out of reach, a soft limit is exceeded, the gripper strays from the path between knots,
+            or the arm collides.
     """
     arm, path = task.arm, task.path
-    (q,) = _solve(task, slice(None), [hold], 1e-9, 100)
-    if isinstance(q, Unreachable):
-        raise _timed(q, float(path.t[q.pose]))
-    spline = Spline.through(path.t, q)
-    times = spline.finer(FINE)
-    q, _ = spline.at(times)
-    beyond = torch.maximum(arm.limits.soft_lower - q, q - arm.limits.soft_upper)
-    if float(beyond.max()) > SLACK:
-        at, joint = divmod(int(beyond.argmax()), q.shape[1])
+    (q,) = _solve(task, slice(None), [orientation], PATH_IK_TOLERANCE, PATH_IK_ITERATIONS)
+    if isinstance(q, UnreachablePose):
+        raise _with_time(q, float(path.t[q.pose_index]))
+    spline = ClampedSpline(path.t, q)
+    q, times = spline.sample(LIMIT_CHECK_PERIOD_S)
+    excess = torch.maximum(arm.limits.soft_lower - q, q - arm.limits.soft_upper)
+    if float(excess.max()) > SOFT_LIMIT_TOLERANCE:
+        at, joint = divmod(int(excess.argmax()), q.shape[1])
         raise InvalidInput(
             f"the motion breaks the soft limit of {arm.joint_names[joint]!r} at t = {float(times[at]):.3g} s",
             got=f"{float(q[at, joint]):.4g}",
             expected=f"{float(arm.limits.soft_lower[joint]):.4g} to {float(arm.limits.soft_upper[joint]):.4g}",
-            remedy="move the path, or choose another hold",
+            remedy="move the path, or choose another orientation",
         )
     _check_tracking(arm, path, spline)
-    if refusal := task.check(*spline.sampled(STEP)):
-        raise refusal
-    return Way(hold, spline, load(arm, spline, task.acceleration))
+    if error := task.check_collisions(*spline.sample(COLLISION_CHECK_PERIOD_S)):
+        raise error
+    return JointPath(orientation, spline, required_slowdown(arm, spline, task.acceleration))
 
 
-def load(arm: Arm, spline: Spline, acceleration: Tensor) -> Load:
-    """The limit that asks for most slowing down, of velocity or of acceleration ``[J]``."""
-    times = spline.finer(FINE)
-    _, velocity = spline.at(times)
-    found = []
-    for what, value, t, limit, power in (
-        ("velocity", velocity.abs(), times, arm.limits.velocity, 1.0),
-        ("acceleration", spline.acceleration.abs(), spline.t, acceleration, 0.5),
+def required_slowdown(arm: Arm, spline: ClampedSpline, acceleration: Tensor) -> RequiredSlowdown:
+    """Return the limit that requires most slowing down: a velocity, or an acceleration ``[J]``."""
+    times = subdivide_times(spline.t, LIMIT_CHECK_PERIOD_S)
+    slowdowns = []
+    for quantity, value, t, limit, power in (
+        ("velocity", spline.velocities(times).abs(), times, arm.limits.velocity, 1.0),
+        ("acceleration", spline.knot_accelerations().abs(), spline.t, acceleration, 0.5),
     ):
-        share = value / limit
-        at, joint = divmod(int(share.argmax()), share.shape[1])
-        factor = float(share[at, joint]) ** power
-        found.append(Load(factor, what, joint, float(t[at]), float(value[at, joint]), float(limit[joint])))
-    return max(found)
+        ratio = value / limit
+        at, joint = divmod(int(ratio.argmax()), ratio.shape[1])
+        factor = float(ratio[at, joint]) ** power
+        slowdowns.append(
+            RequiredSlowdown(factor, quantity, joint, float(t[at]), float(value[at, joint]), float(limit[joint]))
+        )
+    return max(slowdowns)
 
 
-def _judge(task: Task, count: int, holds: Sequence[Hold]) -> tuple[list[Hold], list[tuple[float, InvalidInput]]]:
-    """The holds that reach about ``count`` knots of the path, fastest first; time and error of the others."""
-    knots = _some(task.path, count)
+def _rank(
+    task: PathTask, count: int, orientations: Sequence[GraspOrientation]
+) -> tuple[list[GraspOrientation], list[tuple[float, InvalidInput]]]:
+    """Orientations that reach about ``count`` knots of the path, fastest first; time and error of the others."""
+    knots = _spread_knots(task.path, count)
     times = task.path.t[knots]
-    good, bad = [], []
-    for hold, q in zip(holds, _solve(task, knots, holds, 1e-6, QUICK), strict=True):
-        if isinstance(q, Unreachable):
-            time = float(times[q.pose])
-            bad.append((time, _timed(q, time)))
+    reachable, failed = [], []
+    for orientation, q in zip(
+        orientations, _solve(task, knots, orientations, COARSE_IK_TOLERANCE, COARSE_IK_ITERATIONS), strict=True
+    ):
+        if isinstance(q, UnreachablePose):
+            time = float(times[q.pose_index])
+            failed.append((time, _with_time(q, time)))
             continue
-        if refusal := task.check(q, times):
-            bad.append((float(times[-1]), refusal))
+        if error := task.check_collisions(q, times):
+            failed.append((float(times[-1]), error))
             continue
-        good.append((load(task.arm, Spline.through(times, q), task.acceleration).factor, hold))
-    return [hold for _, hold in sorted(good)], bad
+        slowdown = required_slowdown(task.arm, ClampedSpline(times, q), task.acceleration)
+        reachable.append((slowdown.factor, orientation))
+    return [orientation for _, orientation in sorted(reachable)], failed
 
 
-def _some(path: Trajectory, count: int) -> Tensor:
+def _spread_knots(path: Trajectory, count: int) -> Tensor:
     """Indices of about ``count`` knots, the first and the last among them."""
     return torch.linspace(0, len(path.t) - 1, min(count, len(path.t))).round().long().unique()
 
 
 def _solve(
-    task: Task, knots: Tensor | slice, holds: Sequence[Hold], tolerance: float, iterations: int
-) -> list[Tensor | Unreachable]:
-    pose = task.path.pose[knots].to(task.arm.base).repeat(len(holds), 1, 1, 1)
-    turn = torch.stack([hold.rotation(task.inward.to(pose)) for hold in holds])
+    task: PathTask, knots: Tensor | slice, orientations: Sequence[GraspOrientation], tolerance: float, iterations: int
+) -> list[Tensor | UnreachablePose]:
+    pose = task.path.pose[knots].to(task.arm.base).repeat(len(orientations), 1, 1, 1)
+    turn = torch.stack([orientation.tool_rotation(task.approach.to(pose)) for orientation in orientations])
     pose[..., :3, :3] = pose[..., :3, :3] @ turn[:, None]
-    reference = torch.stack([hold.reference(task.arm) for hold in holds])
-    return solve(task.arm, pose, reference, reference, tolerance, iterations)
+    reference = torch.stack([orientation.reference_posture(task.arm) for orientation in orientations])
+    return solve_inverse_kinematics(task.arm, pose, reference, reference, tolerance, iterations)
 
 
-def _timed(error: Unreachable, time: float) -> InvalidInput:
-    """The error with the time of the pose."""
+def _with_time(error: UnreachablePose, time: float) -> InvalidInput:
     what = f"{error.what}, at t = {time:.3g} s of the path"
-    return InvalidInput(what, got=error.got, remedy="move the grips or the path, or choose another hold")
+    return InvalidInput(what, got=error.got, remedy="move the grips or the path, or choose another orientation")
 
 
-def _check_tracking(arm: Arm, path: Trajectory, spline: Spline) -> None:
-    """Between the knots, too, the joints lead where the path goes, as the layer interpolates it."""
-    sampled = trajectories.interpolate(path.pose[:, :3, 3], path.t, None, FINE)
-    error = (arm(spline.at(sampled.t)[0])[:, :3, 3] - sampled.q).norm(dim=-1)
-    if float(error.max()) > TRACKING:
+def _check_tracking(arm: Arm, path: Trajectory, spline: ClampedSpline) -> None:
+    """Check that the gripper stays on the path between the knots as well, where the layer interpolates it."""
+    sampled = trajectories.interpolate(path.pose[:, :3, 3], path.t, None, LIMIT_CHECK_PERIOD_S)
+    error = (arm(spline.positions(sampled.t))[:, :3, 3] - sampled.q).norm(dim=-1)
+    if float(error.max()) > MAX_PATH_ERROR_M:
         raise InvalidInput(
             f"the joints stray from the path at t = {float(sampled.t[error.argmax()]):.3g} s",
             got=f"{float(error.max()):.2g} m",
-            expected=f"at most {TRACKING:g} m",
+            expected=f"at most {MAX_PATH_ERROR_M:g} m",
             remedy="give the path at more knots, or keep it away from the edge of the arm's reach",
         )

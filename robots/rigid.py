@@ -1,4 +1,4 @@
-"""Formulas of rigid motion that the files of this package share."""
+"""Formulas of rigid motions that several modules of this package share."""
 
 from __future__ import annotations
 
@@ -6,13 +6,17 @@ import math
 from collections.abc import Sequence
 
 import torch
+from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from torchcloth.errors import InvalidInput
 
 
 def origin_matrix(xyz: Sequence[float], rpy: Sequence[float]) -> Tensor:
-    """``[4, 4]`` float64 matrix of a URDF origin: roll, pitch, yaw about fixed axes, that is R = Rz Ry Rx."""
+    """Return the ``[4, 4]`` float64 matrix of a URDF origin.
+
+    Roll, pitch and yaw are about fixed axes: R = Rz Ry Rx.
+    """
     (cr, sr), (cp, sp), (cy, sy) = ((math.cos(angle), math.sin(angle)) for angle in rpy)
     x, y, z = xyz
     rows = [
@@ -25,9 +29,10 @@ def origin_matrix(xyz: Sequence[float], rpy: Sequence[float]) -> Tensor:
 
 
 def joint_modes(origin: Tensor, axis: Tensor, prismatic: Tensor) -> Tensor:
-    """``[J, 4, 4, 4]``: the pose of joint j is modes[j] applied to (1, cos q, sin q, q), which is exact for every type.
+    """Return ``[J, 4, 4, 4]`` modes of the joints: the pose of joint j is modes[j] applied to (1, cos q, sin q, q).
 
-    Rodrigues: R = a a' + cos q (I - a a') + sin q [a]x for a revolute joint; a translation q a for a prismatic one.
+    This is exact for every joint type. A revolute joint follows Rodrigues: R = a a' + cos q (I - a a') + sin q [a]x. A
+    prismatic joint translates by q a.
     """
     x, y, z = axis.unbind(-1)
     zero = torch.zeros_like(x)
@@ -45,25 +50,22 @@ def joint_modes(origin: Tensor, axis: Tensor, prismatic: Tensor) -> Tensor:
 
 
 def twist(pose: Tensor, target: Tensor) -> Tensor:
-    """``[..., 6]`` m and rad: the motion in world axes that takes ``pose [..., 4, 4]`` to ``target``."""
-    turn = target[..., :3, :3] @ pose[..., :3, :3].mT
-    odd = 0.5 * (turn - turn.mT)
-    sine = torch.stack([odd[..., 2, 1], odd[..., 0, 2], odd[..., 1, 0]], dim=-1)
-    cosine = 0.5 * (turn.diagonal(dim1=-2, dim2=-1).sum(-1, keepdim=True) - 1)
-    length = sine.norm(dim=-1, keepdim=True)
-    angle = torch.atan2(length, cosine)
-    little = length <= 1e-6
-    rotation = sine * torch.where(little, 1.0, angle / length)
-    half = (little & (cosine <= 0))[..., 0]
-    if bool(half.any()):  # half a turn: the sine vanishes and any column of turn + I shows the axis
-        column = (turn[half] + torch.eye(3, dtype=turn.dtype, device=turn.device)).mT
-        axis = column[torch.arange(len(column)), column.norm(dim=-1).argmax(-1)]
-        rotation[half] = axis / axis.norm(dim=-1, keepdim=True) * angle[half]
+    """Return the motion ``[..., 6]`` (m and rad, in world axes) that takes ``pose [..., 4, 4]`` to ``target``.
+
+    No gradient flows through its rotation.
+    """
+    turn = (target[..., :3, :3] @ pose[..., :3, :3].mT).detach()
+    rotation = Rotation.from_matrix(turn.reshape(-1, 3, 3).cpu().double().numpy()).as_rotvec()
+    rotation = torch.as_tensor(rotation).to(turn).reshape(turn.shape[:-1])
     return torch.cat([target[..., :3, 3] - pose[..., :3, 3], rotation], dim=-1)
 
 
 def check_rigid(name: str, pose: Tensor) -> None:
-    """Refuses poses ``[..., 4, 4]`` that scale, shear, mirror or project."""
+    """Refuse poses ``[..., 4, 4]`` that scale, shear, mirror or project.
+
+    Raises:
+        InvalidInput: a pose is not rigid.
+    """
     rotation = pose[..., :3, :3]
     eye = torch.eye(4, dtype=pose.dtype, device=pose.device)
     rigid = (rotation @ rotation.mT - eye[:3, :3]).abs().amax() < 1e-5

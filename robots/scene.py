@@ -17,19 +17,26 @@ from .arm import Arm, Primitive, load
 
 # UniFolding (xiaoxiaoxh/UniFolding @ cbd0b37), from its calibration files v23: left base y +0.318, right base y -0.315,
 # both level and unrotated within 0.6 degrees; the rounded symmetric value is used.
-HALF_SPAN = 0.316  # m
+HALF_BASE_SPACING_M = 0.316
 
 
 class Table(NamedTuple):
-    """A table: a block whose upper side is level. Default: UniFolding's, as its settings bound it (same source)."""
+    """A table: a block whose upper side is level. The default is UniFolding's, from its settings (same source).
 
-    x: tuple[float, float] = (0.20, 1.02)  # m, from and to
-    y: tuple[float, float] = (-0.82, 0.82)  # m
-    height: float = 0.0  # m, of its upper side
-    thickness: float = 0.04  # m
+    Attributes:
+        x: m, from and to.
+        y: m, from and to.
+        height: m, of its upper side.
+        thickness: m.
+    """
+
+    x: tuple[float, float] = (0.20, 1.02)
+    y: tuple[float, float] = (-0.82, 0.82)
+    height: float = 0.0
+    thickness: float = 0.04
 
     def primitive(self, dtype: torch.dtype = torch.float64) -> Primitive:
-        """The block, for drawing, for what a camera sees and for clearance."""
+        """Return the block, for drawings, cameras and clearance."""
         (x0, x1), (y0, y1) = self.x, self.y
         pose = torch.eye(4, dtype=dtype)
         pose[:3, 3] = torch.tensor([(x0 + x1) / 2, (y0 + y1) / 2, self.height - self.thickness / 2], dtype=dtype)
@@ -37,11 +44,11 @@ class Table(NamedTuple):
 
 
 class Scene(nn.Module):
-    """Arms by name, each where its own ``base`` says, and perhaps a table.
+    """Arms by name, each at its own ``base``, and optionally a table.
 
     Args:
         arms: name to arm, e.g. ``{"left": load("rizon4", base=...), "right": ...}``. The names are those of the grasps.
-        table: that the arms must not touch with more than their fingers; None: there is none.
+        table: which the arms must touch with nothing but their fingers; None: there is none.
     """
 
     def __init__(self, arms: Mapping[str, Arm], table: Table | None = None) -> None:
@@ -63,14 +70,14 @@ class Scene(nn.Module):
         return cast(Arm, self.arms[name])
 
     def forward(self, q: Mapping[str, Tensor]) -> dict[str, Tensor]:
-        """Poses in the world, ``[..., 4, 4]`` m by name, from joint positions ``[..., J]`` by name."""
+        """Compute the poses ``[..., 4, 4]`` m by name, from joint positions ``[..., J]`` by name."""
         self._check_names("q", q)
         return {name: self[name](q[name]) for name in self.arms}
 
     def motion(
         self, q: Mapping[str, Tensor], t: Tensor, closed: Mapping[str, Tensor] | None = None, **options: Any
     ) -> dict[str, Trajectory]:
-        """Motions of all arms through waypoints at common times.
+        """Compute the motions of all arms through waypoints at common times.
 
         Args:
             q: joint waypoints ``[..., K, J]`` (rad or m) by name.
@@ -85,12 +92,12 @@ class Scene(nn.Module):
         return {name: self[name].motion(q[name], t, closed.get(name), **options) for name in self.arms}
 
     def geometry(self, q: Mapping[str, Tensor]) -> list[Primitive]:
-        """The solids of all arms in the world, at joint positions ``[..., J]`` by name."""
+        """Return the solids of all arms in the world, at joint positions ``[..., J]`` by name."""
         self._check_names("q", q)
         return [primitive for name in self.arms for primitive in self[name].geometry(q[name])]
 
-    def infos(self) -> dict[str, RobotInfo]:
-        """What a recording says about the arms, by name."""
+    def robot_infos(self) -> dict[str, RobotInfo]:
+        """Return what a recording stores about the arms, by name."""
         return {
             name: RobotInfo(self[name].model, self[name].base.detach().double().cpu().numpy(), self[name].frame)
             for name in self.arms
@@ -103,7 +110,7 @@ class Scene(nn.Module):
 
 
 def _check_table(table: Table) -> None:
-    """One without volume or with NaN would be in nobody's way."""
+    """A table without volume or with NaN would collide with nothing."""
     (x0, x1), (y0, y1) = table.x, table.y
     bounded = all(map(math.isfinite, (x0, x1, y0, y1, table.height, table.thickness)))
     if not (bounded and x0 < x1 and y0 < y1 and table.thickness > 0):
@@ -112,19 +119,19 @@ def _check_table(table: Table) -> None:
 
 
 def bimanual_rig(model: str = "rizon4", frame: str = "tcp_closed", dtype: torch.dtype = torch.float64) -> Scene:
-    """Two arms side by side as in UniFolding's rig: ``left`` at (0, 0.316, 0) m, ``right`` at (0, -0.316, 0) m.
+    """Build two arms side by side as in UniFolding's rig: ``left`` at (0, 0.316, 0) m, ``right`` at (0, -0.316, 0) m.
 
     World: origin midway between the bases, x away from the robots over the table, y to the left arm, z up. The table's
     top is level with the bases, at z = 0. The positions are the rounded calibration of xiaoxiaoxh/UniFolding @ cbd0b37;
     its arms of 2023 very likely had the wrist of ``rizon4_gen2022``.
 
     Args:
-        model: one of ``models()`` or the path of a URDF file.
+        model: one of ``list_models()`` or the path of a URDF file.
         frame: the link whose pose is computed.
         dtype: of every tensor of the arms.
     """
     arms = {}
-    for name, y in (("left", HALF_SPAN), ("right", -HALF_SPAN)):
+    for name, y in (("left", HALF_BASE_SPACING_M), ("right", -HALF_BASE_SPACING_M)):
         base = torch.eye(4, dtype=dtype)
         base[1, 3] = y
         arms[name] = load(model, frame=frame, base=base, dtype=dtype)

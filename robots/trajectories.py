@@ -1,4 +1,4 @@
-"""Joint waypoints to a densely sampled joint motion, and the check that the arm can follow it."""
+"""Densely sampled joint motions through waypoints, the check of their limits, and the minimum-jerk profile."""
 
 from __future__ import annotations
 
@@ -10,17 +10,40 @@ from torch import Tensor
 
 from torchcloth.errors import InvalidInput
 
+from .chain import JointLimits
 
-class Sampled(NamedTuple):
-    """A joint motion at sample times; every waypoint is one of them."""
+LIMIT_ROUNDING = 1e-9  # rad or m, and relative for velocities: excess of a limit that is rounding
 
-    t: Tensor  # [S] s
-    q: Tensor  # [..., S, J] rad or m
-    waypoint: Tensor  # [S] long, the last waypoint at or before each sample
+
+class SampledJointMotion(NamedTuple):
+    """A joint motion at sample times; every waypoint is one of them.
+
+    Attributes:
+        t: [S] s.
+        q: [..., S, J] rad or m.
+        waypoint: [S] int64, the last waypoint at or before each sample.
+    """
+
+    t: Tensor
+    q: Tensor
+    waypoint: Tensor
+
+
+def minimum_jerk(u: Tensor) -> Tensor:
+    """Return the fraction of the path at fraction ``u`` of the time, for least jerk and rest at both ends.
+
+    The polynomial is 10 u^3 - 15 u^4 + 6 u^5 (Flash and Hogan 1985).
+    """
+    return u**3 * (10 + u * (6 * u - 15))
 
 
 def check_waypoints(q: Tensor, t: Tensor, **masks: Tensor | None) -> None:
-    """Refuses waypoints ``q [..., K, J]`` that no motion at times ``t [K]`` can be made from."""
+    """Refuse waypoints ``q [..., K, J]`` that define no motion at times ``t [K]`` s.
+
+    Raises:
+        InvalidInput: wrong shapes, times that do not increase, numbers that are not finite, or masks that are not
+            boolean.
+    """
     if q.ndim < 2:
         raise InvalidInput("q has the wrong shape", got=tuple(q.shape), expected="(..., K, J)")
     knots = q.shape[-2]
@@ -41,13 +64,13 @@ def check_waypoints(q: Tensor, t: Tensor, **masks: Tensor | None) -> None:
             raise InvalidInput(f"{name} has the wrong shape or type", got=got, expected=f"torch.bool ({knots},)")
 
 
-def interpolate(q: Tensor, t: Tensor, stop: Tensor | None, period: float) -> Sampled:
-    """Cubic Hermite interpolation with Catmull-Rom velocities: C1, and linear in ``q``.
+def interpolate(q: Tensor, t: Tensor, stop: Tensor | None, period: float) -> SampledJointMotion:
+    """Interpolate waypoints by cubic Hermite curves with Catmull-Rom velocities: C1, and linear in ``q``.
 
     Args:
         q: ``[..., K, J]`` waypoints.
         t: ``[K]`` s, their times; they may require grad.
-        stop: ``[K]`` bool, where every joint comes to rest; by default at both ends.
+        stop: ``[K]`` bool, waypoints at which every joint comes to rest; by default the first and the last.
         period: s, the longest time between two samples.
     """
     if not (math.isfinite(period) and period > 0):
@@ -74,29 +97,32 @@ def interpolate(q: Tensor, t: Tensor, stop: Tensor | None, period: float) -> Sam
     )
     waypoint = interval.clone()
     waypoint[-1] += 1
-    return Sampled(t[interval] + u * h, samples, waypoint)
+    return SampledJointMotion(t[interval] + u * h, samples, waypoint)
 
 
 def _velocities(q: Tensor, duration: Tensor) -> Tensor:
-    """Velocity at each waypoint: of the parabola through it and its neighbours; at the ends, of the line."""
+    """Velocity at each waypoint: that of the parabola through it and its neighbours; at the ends, that of the line."""
     slope = q.diff(dim=-2) / duration[:, None]
     before, after = duration[:-1, None], duration[1:, None]
     inner = (after * slope[..., :-1, :] + before * slope[..., 1:, :]) / (before + after)
     return torch.cat([slope[..., :1, :], inner, slope[..., -1:, :]], dim=-2)
 
 
-def check_limits(motion: Sampled, names: tuple[str, ...], units: tuple[str, ...], limits: Tensor) -> None:
-    """Refuses a motion beyond a joint's hard position limits or its velocity limit.
+def check_limits(
+    motion: SampledJointMotion, names: tuple[str, ...], units: tuple[str, ...], limits: JointLimits
+) -> None:
+    """Refuse a motion beyond a joint's hard position limits or its velocity limit.
 
-    Velocities are differences of samples. ``limits`` is ``[6, J]``: lower, upper, soft ones, velocity, effort.
+    Velocities are differences of samples.
+
+    Raises:
+        InvalidInput: names the joint, the limit and the time.
     """
     q, t = motion.q.detach(), motion.t.detach()
-    lower, upper, _, _, fastest, _ = limits
-    slack = 1e-9
-    _refuse("position", q, t, lower - slack, upper + slack, names, units)
-    speed = q.diff(dim=-2) / t.diff()[:, None]
-    bound = fastest * (1 + slack)
-    _refuse("velocity", speed, t, -bound, bound, names, tuple(f"{unit}/s" for unit in units))
+    _refuse("position", q, t, limits.lower - LIMIT_ROUNDING, limits.upper + LIMIT_ROUNDING, names, units)
+    velocity = q.diff(dim=-2) / t.diff()[:, None]
+    bound = limits.velocity * (1 + LIMIT_ROUNDING)
+    _refuse("velocity", velocity, t, -bound, bound, names, tuple(f"{unit}/s" for unit in units))
 
 
 def _refuse(

@@ -1,12 +1,13 @@
-"""What a robot does with cloth that it holds: eight families of motion, as paths of the grippers.
+"""Eight families of robot motion with cloth, as paths of the grippers.
 
 ``cover``, ``drag``, ``fold`` and ``hang`` start with cloth on the table, the others (``fling``, ``stretch``, ``swing``,
-``shake``) with cloth that hangs. World: z up, the table's top at z = 0. ``robots.plan`` gives joint motions for a path.
+``shake``) with hanging cloth. World: z up, the table's top at z = 0. ``robots.plan`` computes joint motions for a path.
 """
 
 from __future__ import annotations
 
-from .base import Action, Limits, minimum_jerk
+from ..trajectories import minimum_jerk
+from .base import Action, GripperLimits
 from .cover import cover
 from .drag import drag
 from .fling import fling
@@ -18,7 +19,7 @@ from .swing import swing
 
 __all__ = [
     "Action",
-    "Limits",
+    "GripperLimits",
     "cover",
     "drag",
     "fling",

@@ -4,7 +4,17 @@ from __future__ import annotations
 
 import math
 
-from .base import Action, Grips, Limits, Move, action, along, check, finite, lowest
+from .base import (
+    Action,
+    GripperLimits,
+    Grips,
+    Move,
+    build_action,
+    check_finite,
+    check_positive,
+    horizontal_shift,
+    min_grip_height,
+)
 
 
 def fling(
@@ -15,26 +25,30 @@ def fling(
     landing: float = 0.03,
     pull: float = 0.3,
     rest: float = 0.4,
-    limits: Limits = Limits(),  # noqa: B008 - immutable
+    limits: GripperLimits = GripperLimits(),  # noqa: B008 - immutable
 ) -> Action:
     """Swing hanging cloth back and forward, lay it down while drawing back, open, wait.
 
     Args:
         grips: where the grippers hold, high above the table.
-        swing: to either side of the start [m].
-        heading: forward, from the world's x axis [rad].
-        landing: the grip's height where it opens [m].
-        pull: horizontal way while going down, against the heading [m].
-        rest: time after opening [s].
+        swing: m, to either side of the start.
+        heading: rad, forward direction, from the world's x axis.
+        landing: m, the grip's height where it opens.
+        pull: m, horizontal displacement while going down, against the heading.
+        rest: s, time after opening.
         limits: of the grippers.
 
     Raises:
-        InvalidInput: a value that gives no motion, or a path through the table.
+        InvalidInput: a value that defines no motion, or a path through the table.
     """
-    check(swing=swing, landing=landing)
-    finite(pull=pull)
-    drop = landing - lowest(grips)
-    check(**{"grips' height over the landing": -drop})
-    shifts = [along(heading, -swing), along(heading, 2 * swing), along(heading, -pull, drop)]
+    check_positive(swing=swing, landing=landing)
+    check_finite(pull=pull)
+    drop = landing - min_grip_height(grips)
+    check_positive(**{"grips' height over the landing": -drop})
+    shifts = [
+        horizontal_shift(heading, -swing),
+        horizontal_shift(heading, 2 * swing),
+        horizontal_shift(heading, -pull, drop),
+    ]
     moves = [Move(shift) for shift in shifts]
-    return action(grips, moves, heading, rest, limits)
+    return build_action(grips, moves, heading, rest, limits)

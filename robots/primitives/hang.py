@@ -1,8 +1,8 @@
-"""Hang: cloth is lifted and left to hang."""
+"""Hang: cloth is lifted and hangs still."""
 
 from __future__ import annotations
 
-from .base import Action, Grips, Limits, Move, action, along, finite, rise_to
+from .base import Action, GripperLimits, Grips, Move, build_action, check_finite, compute_rise, horizontal_shift
 
 
 def hang(
@@ -12,21 +12,21 @@ def hang(
     heading: float = 0.0,
     carry: float = 0.0,
     rest: float = 1.0,
-    limits: Limits = Limits(),  # noqa: B008 - immutable
+    limits: GripperLimits = GripperLimits(),  # noqa: B008 - immutable
 ) -> Action:
-    """Lift the held part, carry it along while lifting, and wait for the cloth to come to rest. They never open.
+    """Lift the held part, carry it along while lifting, and wait until the cloth rests. The grippers never open.
 
     Args:
         grips: where the grippers hold, at the start.
-        height: of the lowest gripper above the table at the end [m].
-        heading: direction in which the cloth is carried, from the world's x axis [rad].
-        carry: how far [m]; negative goes against the heading.
-        rest: time at the end [s].
+        height: m, of the lowest gripper above the table at the end.
+        heading: rad, direction in which the cloth is carried, from the world's x axis.
+        carry: m, how far; negative values go against the heading.
+        rest: s, time at the end.
         limits: of the grippers.
 
     Raises:
-        InvalidInput: a value that gives no motion, or a height below the grips.
+        InvalidInput: a value that defines no motion, or a height below the grips.
     """
-    rise = rise_to(height, grips)
-    finite(carry=carry)
-    return action(grips, [Move(along(heading, carry, rise))], heading, rest, limits, release=False)
+    rise = compute_rise(height, grips)
+    check_finite(carry=carry)
+    return build_action(grips, [Move(horizontal_shift(heading, carry, rise))], heading, rest, limits, release=False)

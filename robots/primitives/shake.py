@@ -1,11 +1,11 @@
-"""Shake: hanging cloth is moved up and down fast."""
+"""Shake: hanging cloth is moved fast over a short distance."""
 
 from __future__ import annotations
 
 import math
 
-from .base import Action, Grips, Limits, finite
-from .swing import to_and_fro
+from .base import Action, GripperLimits, Grips, check_finite
+from .swing import build_oscillation
 
 
 def shake(
@@ -17,24 +17,24 @@ def shake(
     elevation: float = math.pi / 2,
     heading: float = 0.0,
     rest: float = 0.4,
-    limits: Limits = Limits(),  # noqa: B008 - immutable
+    limits: GripperLimits = GripperLimits(),  # noqa: B008 - immutable
 ) -> Action:
-    """Shake hanging cloth, to take out its creases: short ways, fast, up and down unless told otherwise.
+    """Shake hanging cloth to remove its creases: short fast moves, up and down by default.
 
     Args:
         grips: where the grippers hold, at the start.
-        amplitude: to either side of the start [m].
-        cycles: how often.
-        period: of one cycle, if the limits allow [s].
-        elevation: of the direction above the horizontal [rad]; 0 shakes along the heading.
-        heading: from the world's x axis [rad].
-        rest: time at the end [s].
+        amplitude: m, to either side of the start.
+        cycles: number of cycles.
+        period: s, of one cycle, if the limits allow it.
+        elevation: rad, of the direction above the horizontal; 0 shakes along the heading.
+        heading: rad, from the world's x axis.
+        rest: s, time at the end.
         limits: of the grippers.
 
     Raises:
-        InvalidInput: a value that gives no motion, or a path through the table.
+        InvalidInput: a value that defines no motion, or a path through the table.
     """
-    finite(elevation=elevation, heading=heading)
+    check_finite(elevation=elevation, heading=heading)
     flat = math.cos(elevation)
     direction = (flat * math.cos(heading), flat * math.sin(heading), math.sin(elevation))
-    return to_and_fro(grips, amplitude, direction, cycles, period, heading, rest, limits)
+    return build_oscillation(grips, amplitude, direction, cycles, period, heading, rest, limits)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from .base import Action, Grips, Limits, Move, action, check, whole
+from .base import Action, GripperLimits, Grips, Move, build_action, check_positive, check_whole
 
 
 def stretch(
@@ -12,22 +12,22 @@ def stretch(
     cycles: int = 1,
     hold: float = 0.3,
     rest: float = 0.3,
-    limits: Limits = Limits(),  # noqa: B008 - immutable
+    limits: GripperLimits = GripperLimits(),  # noqa: B008 - immutable
 ) -> Action:
-    """Move two grippers apart along their line, hold, and go back; as often as asked. They never open.
+    """Move two grippers apart along their line, wait, and move back, repeatedly. The grippers never open.
 
     Args:
         grips: where the two grippers hold, at the start.
-        by: how much their distance grows [m].
-        cycles: how often.
-        hold: the way out takes so long [s], and the way back, if the limits allow.
-        rest: time at the end [s].
+        by: m, increase of their distance.
+        cycles: number of cycles.
+        hold: s, duration of the move outwards and of the move back, if the limits allow it.
+        rest: s, time at the end.
         limits: of the grippers.
 
     Raises:
-        InvalidInput: a value that gives no motion, or another number of grippers than two.
+        InvalidInput: a value that defines no motion, or another number of grippers than two.
     """
-    check(by=by, hold=hold)
-    whole(cycles=cycles)
-    moves = [Move(apart=by, least=hold), Move(apart=-by, least=hold)] * int(cycles)
-    return action(grips, moves, 0.0, rest, limits, release=False)
+    check_positive(by=by, hold=hold)
+    check_whole(cycles=cycles)
+    moves = [Move(separation=by, min_duration=hold), Move(separation=-by, min_duration=hold)] * int(cycles)
+    return build_action(grips, moves, 0.0, rest, limits, release=False)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from .base import Action, Grips, Limits, Move, action, along, check, whole
+from .base import Action, GripperLimits, Grips, Move, build_action, check_positive, check_whole, horizontal_shift
 
 
 def swing(
@@ -13,26 +13,26 @@ def swing(
     period: float = 1.4,
     heading: float = 0.0,
     rest: float = 0.3,
-    limits: Limits = Limits(),  # noqa: B008 - immutable
+    limits: GripperLimits = GripperLimits(),  # noqa: B008 - immutable
 ) -> Action:
-    """Move hanging cloth to and fro about the start, and end there. They never open.
+    """Move hanging cloth to and fro about the start, and end there. The grippers never open.
 
     Args:
         grips: where the grippers hold, at the start.
-        amplitude: to either side of the start [m].
-        cycles: how often forward and back.
-        period: of one cycle, if the limits allow [s].
-        heading: of the first side, from the world's x axis [rad].
-        rest: time at the end [s].
+        amplitude: m, to either side of the start.
+        cycles: number of cycles.
+        period: s, of one cycle, if the limits allow it.
+        heading: rad, direction of the first half cycle, from the world's x axis.
+        rest: s, time at the end.
         limits: of the grippers.
 
     Raises:
-        InvalidInput: a value that gives no motion.
+        InvalidInput: a value that defines no motion.
     """
-    return to_and_fro(grips, amplitude, along(heading, 1.0), cycles, period, heading, rest, limits)
+    return build_oscillation(grips, amplitude, horizontal_shift(heading, 1.0), cycles, period, heading, rest, limits)
 
 
-def to_and_fro(
+def build_oscillation(
     grips: Grips,
     amplitude: float,
     direction: tuple[float, float, float],
@@ -40,13 +40,26 @@ def to_and_fro(
     period: float,
     heading: float,
     rest: float,
-    limits: Limits,
+    limits: GripperLimits,
 ) -> Action:
-    """Half a way out, whole ways between both ends, half a way home, along a unit vector."""
-    check(amplitude=amplitude, period=period)
-    whole(cycles=cycles)
+    """Build half a swing out, full swings between both ends, and half a swing back, along a unit vector.
+
+    Args:
+        grips: where the grippers hold, at the start.
+        amplitude: m, to either side of the start.
+        direction: unit vector of the first half swing.
+        cycles: number of cycles.
+        period: s, of one cycle, if the limits allow it.
+        heading: rad, of the motion, from the world's x axis.
+        rest: s, time at the end.
+        limits: of the grippers.
+    """
+    check_positive(amplitude=amplitude, period=period)
+    check_whole(cycles=cycles)
     half = period / 2
-    ways = [(1, 0.5 * half), *((2 * (-1) ** k, half) for k in range(1, 2 * int(cycles))), (1, 0.5 * half)]
+    swings = [(1, 0.5 * half), *((2 * (-1) ** k, half) for k in range(1, 2 * int(cycles))), (1, 0.5 * half)]
     x, y, z = direction
-    moves = [Move((w * amplitude * x, w * amplitude * y, w * amplitude * z), least=least) for w, least in ways]
-    return action(grips, moves, heading, rest, limits, release=False)
+    moves = [
+        Move((w * amplitude * x, w * amplitude * y, w * amplitude * z), min_duration=duration) for w, duration in swings
+    ]
+    return build_action(grips, moves, heading, rest, limits, release=False)

@@ -21,7 +21,7 @@ def rows(model, key):
     return torch.tensor([row[key] for row in ORACLE[model]], dtype=torch.float64)
 
 
-@pytest.mark.parametrize("model", robots.models())
+@pytest.mark.parametrize("model", robots.list_models())
 def test_flange_against_the_oracle(model):
     pose = robots.load(model)(rows(model, "q"))
     # The oracle is rounded to 12 decimals in q and in the pose: up to 7 joints x 0.5e-12 rad x 1.2 m.
@@ -83,9 +83,9 @@ def test_a_base_that_an_optimiser_would_change_is_no_copy():
     assert robots.load("rizon4", base=base, dtype=torch.float32).base is base
 
 
-@pytest.mark.parametrize("own", [False, True], ids=["rizon4", "own"])
-def test_derivatives(own, crane, random_q):
-    arm = robots.load(crane, frame="hook") if own else robots.load("rizon4")
+@pytest.mark.parametrize("custom", [False, True], ids=["rizon4", "custom"])
+def test_derivatives(custom, crane, random_q):
+    arm = robots.load(crane, frame="hook") if custom else robots.load("rizon4")
     q = random_q(arm, 2).requires_grad_()
     assert torch.autograd.gradcheck(arm, (q,), check_forward_ad=True)
     assert torch.autograd.gradgradcheck(arm, (q,), check_fwd_over_rev=True)
@@ -104,9 +104,9 @@ def test_forward_mode_and_transforms_agree(random_q):
     torch.testing.assert_close(torch.func.vmap(arm)(torch.stack([q, direction])), arm(torch.stack([q, direction])))
 
 
-@pytest.mark.parametrize("own", [False, True], ids=["rizon4", "own"])
-def test_geometric_jacobian(own, crane, random_q):
-    arm = robots.load(crane, frame="hook") if own else robots.load("rizon4")
+@pytest.mark.parametrize("custom", [False, True], ids=["rizon4", "custom"])
+def test_geometric_jacobian(custom, crane, random_q):
+    arm = robots.load(crane, frame="hook") if custom else robots.load("rizon4")
     q = random_q(arm, 4)
     derivative = torch.func.vmap(torch.func.jacfwd(arm))(q)  # [4, 4, 4, J]
     spin = torch.einsum("nabj,ncb->nacj", derivative[:, :3, :3], arm(q)[:, :3, :3])

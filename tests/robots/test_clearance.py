@@ -9,7 +9,14 @@ from scipy.optimize import minimize
 
 from torchcloth import robots
 from torchcloth.robots.arm import Primitive
-from torchcloth.robots.clearance import EXACT, FAR, Named, Solids, distances, nearest
+from torchcloth.robots.clearance import (
+    DISTANCE_TOLERANCE_M,
+    MAX_RESOLVED_GAP_M,
+    NamedSolid,
+    Solids,
+    bound_distances,
+    smallest_gap,
+)
 
 # flexiv_ros2's MoveIt set-up: pairs that are never checked because no posture brings them together
 NEVER = {(0, 2), (0, 3), (0, 4), (1, 3), (1, 4), (2, 4), (2, 5), (3, 5), (3, 6), (3, 7), (4, 6), (4, 7)}
@@ -25,8 +32,8 @@ def pose(x=0.0, y=0.0, z=0.0, about_x=0.0, about_z=0.0):
 
 
 def distance(a: Primitive, b: Primitive) -> float:
-    one, other = (Solids.of([p], 1).pick(torch.tensor([0]), torch.tensor([0])) for p in (a, b))
-    return float(distances(one, other))
+    one, other = (Solids.from_primitives([p], 1).select(torch.tensor([0]), torch.tensor([0])) for p in (a, b))
+    return float(bound_distances(one, other))
 
 
 def box(*size, **place):
@@ -55,9 +62,9 @@ def sphere(radius, **place):
 )
 def test_closed_forms(a, b, truth):
     for first, second in ((a, b), (b, a)):
-        found = distance(first, second)
-        assert found <= truth + 1e-9, "a lower bound"
-        assert found == pytest.approx(truth, abs=EXACT)
+        result = distance(first, second)
+        assert result <= truth + 1e-9, "a lower bound"
+        assert result == pytest.approx(truth, abs=DISTANCE_TOLERANCE_M)
 
 
 @pytest.mark.parametrize("overlapping", [sphere(0.2, x=0.15), box(0.3, 0.1, 0.1), cylinder(0.3, 0.1, about_x=1.0)])
@@ -75,8 +82,8 @@ def test_against_an_optimiser():
     for _ in range(12):
         a = box(draw(0.1, 0.3), draw(0.1, 0.3), draw(0.1, 0.3), about_x=draw(-3, 3), about_z=draw(-3, 3))
         b = cylinder(draw(0.05, 0.1), draw(0.1, 0.4), x=draw(0.3, 0.5), z=draw(-0.3, 0.3), about_x=draw(-3, 3))
-        found, truth = distance(a, b), optimised(a, b)
-        assert found == pytest.approx(max(truth, 0), abs=3e-4)
+        result, truth = distance(a, b), optimised(a, b)
+        assert result == pytest.approx(max(truth, 0), abs=3e-4)
 
 
 def optimised(a, b):
@@ -88,36 +95,40 @@ def optimised(a, b):
     radius, length = b.size
     bounds = [(-1, 1)] * 3 + [(-radius, radius)] * 2 + [(-length / 2, length / 2)]
     inside = {"type": "ineq", "fun": lambda u: radius**2 - u[3] ** 2 - u[4] ** 2}
-    found = minimize(lambda u: (ends(u) ** 2).sum(), [0.0] * 6, bounds=bounds, constraints=inside, tol=1e-12)
-    return math.sqrt(found.fun)
+    result = minimize(lambda u: (ends(u) ** 2).sum(), [0.0] * 6, bounds=bounds, constraints=inside, tol=1e-12)
+    return math.sqrt(result.fun)
 
 
 def test_nearest_finds_pair_and_time():
     path = torch.eye(4, dtype=torch.float64).repeat(5, 1, 1)
     path[:, 0, 3] = torch.tensor([1.0, 0.5, 0.26, 0.5, 1.0])
     solids = [
-        Named("post", sphere(0.1)),
-        Named("hand", Primitive("sphere", (0.1,), path, "hand")),
-        Named("far", sphere(0.1, x=9)),
+        NamedSolid("post", sphere(0.1)),
+        NamedSolid("hand", Primitive("sphere", (0.1,), path, "hand")),
+        NamedSolid("far", sphere(0.1, x=9)),
     ]
-    gap = nearest(solids, [(0, 1), (0, 2)], torch.arange(5) * 0.1)
+    gap = smallest_gap(solids, [(0, 1), (0, 2)], torch.arange(5) * 0.1)
     assert (gap.first, gap.second, gap.time) == ("post", "hand", pytest.approx(0.2))
-    assert gap.distance == pytest.approx(0.06, abs=EXACT)
-    assert nearest(solids, [(0, 2)], torch.arange(5)).distance == FAR
-    assert nearest(solids, [], torch.arange(5)).distance == FAR
-    apart = [Named(str(x), sphere(0.1, x=x)) for x in (0.0, 0.5)]
-    assert nearest(apart, [(0, 1)], torch.arange(1)).distance == FAR
-    assert nearest(apart, [(0, 1)], torch.arange(1), least=0.4).distance == pytest.approx(0.3, abs=EXACT)
+    assert gap.distance == pytest.approx(0.06, abs=DISTANCE_TOLERANCE_M)
+    assert smallest_gap(solids, [(0, 2)], torch.arange(5)).distance == MAX_RESOLVED_GAP_M
+    assert smallest_gap(solids, [], torch.arange(5)).distance == MAX_RESOLVED_GAP_M
+    apart = [NamedSolid(str(x), sphere(0.1, x=x)) for x in (0.0, 0.5)]
+    assert smallest_gap(apart, [(0, 1)], torch.arange(1)).distance == MAX_RESOLVED_GAP_M
+    assert smallest_gap(apart, [(0, 1)], torch.arange(1), min_distance=0.4).distance == pytest.approx(
+        0.3, abs=DISTANCE_TOLERANCE_M
+    )
 
 
 def test_links_that_the_makers_never_check_cannot_meet(random_q):
     """The primitives agree with Flexiv's own meshes about which links can collide."""
     arm = robots.load("rizon4")
     q = random_q(arm, 150)
-    solids = [Named(p.link, p) for p in arm.geometry(q)]
-    never = [(i, j) for i, j in combinations(range(len(solids)), 2) if (arm.bodies[i], arm.bodies[j]) in NEVER]
-    assert {(arm.bodies[i], arm.bodies[j]) for i, j in never} == NEVER
+    solids = [NamedSolid(p.link, p) for p in arm.geometry(q)]
+    never = [
+        (i, j) for i, j in combinations(range(len(solids)), 2) if (arm.solid_joints[i], arm.solid_joints[j]) in NEVER
+    ]
+    assert {(arm.solid_joints[i], arm.solid_joints[j]) for i, j in never} == NEVER
     for i, j in never:
-        assert nearest(solids, [(i, j)], torch.arange(150)).distance > 0.005, (solids[i].name, solids[j].name)
-    met = [(i, j) for i, j in combinations(range(len(solids)), 2) if arm.bodies[j] - arm.bodies[i] > 4]
-    assert nearest(solids, met, torch.arange(150)).distance <= 0, "others can"
+        assert smallest_gap(solids, [(i, j)], torch.arange(150)).distance > 0.005, (solids[i].name, solids[j].name)
+    met = [(i, j) for i, j in combinations(range(len(solids)), 2) if arm.solid_joints[j] - arm.solid_joints[i] > 4]
+    assert smallest_gap(solids, met, torch.arange(150)).distance <= 0, "others can"

@@ -29,7 +29,7 @@ def line(arm, count):
     return poses
 
 
-@pytest.mark.parametrize("model", robots.models())
+@pytest.mark.parametrize("model", robots.list_models())
 def test_round_trip(model, random_q):
     arm = robots.load(model)
     poses = arm(random_q(arm, 30, seed=1))
@@ -123,9 +123,9 @@ def test_paths_side_by_side_know_nothing_of_each_other(arm, random_q):
     hard = arm(random_q(arm, 1, seed=7)).expand(10, -1, -1)  # far from home
     paths = torch.stack([line(arm, 10), beyond, elsewhere, hard])
     home = arm.home.expand(4, -1)
-    one, lost, other, far = inverse.solve(arm, paths, home, home, 1e-6, 100)
-    assert isinstance(lost, inverse.Unreachable)
-    assert lost.pose == 6
-    for found, poses in ((one, paths[0]), (other, elsewhere), (far, hard)):
-        assert_reached(arm, found, poses)
-        torch.testing.assert_close(found, arm.inverse(poses, tolerance=1e-6), rtol=0, atol=1e-6)
+    one, missing, other, far = inverse.solve_inverse_kinematics(arm, paths, home, home, 1e-6, 100)
+    assert isinstance(missing, inverse.UnreachablePose)
+    assert missing.pose_index == 6
+    for result, poses in ((one, paths[0]), (other, elsewhere), (far, hard)):
+        assert_reached(arm, result, poses)
+        torch.testing.assert_close(result, arm.inverse(poses, tolerance=1e-6), rtol=0, atol=1e-6)

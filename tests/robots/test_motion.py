@@ -11,7 +11,7 @@ import torch
 import torchcloth.robots as robots
 from torchcloth import recordings as rec
 from torchcloth.errors import InvalidInput, RecordingError
-from torchcloth.robots.replay import unwound
+from torchcloth.robots.replay import unwrap_joints
 from torchcloth.types import Trajectory
 
 
@@ -105,23 +105,23 @@ def test_limits_are_refused_by_name(arm, waypoints, crane):
         arm.motion(waypoints, TIMES / 10)
     assert arm.motion(high, TIMES, check_limits=False).pose.isfinite().all()
 
-    own = robots.load(crane, frame="hook")
-    q = own.home + torch.tensor([[0.0, 0.0, 0.0], [0.0, 2.0, 0.0]], dtype=torch.float64)
+    custom = robots.load(crane, frame="hook")
+    q = custom.home + torch.tensor([[0.0, 0.0, 0.0], [0.0, 2.0, 0.0]], dtype=torch.float64)
     with pytest.raises(InvalidInput, match=r"position limit of joint 'travel'.* m;"):
-        own.motion(q, [0.0, 20.0])
+        custom.motion(q, [0.0, 20.0])
     q[1, 1] = 1.0
     with pytest.raises(InvalidInput, match=r"velocity limit of joint 'travel'.* m/s;"):
-        own.motion(q, [0.0, 1.0])
+        custom.motion(q, [0.0, 1.0])
     q[1] = torch.tensor([100.0, 0.2, 0.0])  # a continuous joint has neither limit
-    assert own.motion(q, [0.0, 1.0]).pose.isfinite().all()
+    assert custom.motion(q, [0.0, 1.0]).pose.isfinite().all()
 
 
 def test_takes_masks_as_recordings_hold_them(arm, waypoints):
-    held, stop = [True, True, False, False], [True, False, False, True]
-    wanted = arm.motion(waypoints, TIMES, torch.tensor(held), stop=torch.tensor(stop))
+    holding, stop = [True, True, False, False], [True, False, False, True]
+    wanted = arm.motion(waypoints, TIMES, torch.tensor(holding), stop=torch.tensor(stop))
     for make in (list, np.array):
-        found = arm.motion(waypoints.numpy(), TIMES.numpy(), make(held), stop=make(stop))
-        assert all(torch.equal(a, b) for a, b in zip(found, wanted, strict=True))
+        result = arm.motion(waypoints.numpy(), TIMES.numpy(), make(holding), stop=make(stop))
+        assert all(torch.equal(a, b) for a, b in zip(result, wanted, strict=True))
 
 
 def test_refuses_half_the_digits(arm):
@@ -153,7 +153,7 @@ def test_a_path_is_recorded_and_replayed(random_q, tmp_path):
     pose = arm(random_q(arm, 40, seed=5))
     pose[0, :3, :3] = torch.diag(torch.tensor([1.0, -1, -1], dtype=torch.float64))
     path = Trajectory(torch.linspace(0, 1, 40, dtype=torch.float64), pose, torch.arange(40) < 30)
-    motion = robots.gripper_motion(path)
+    motion = robots.to_gripper_motion(path)
     again = robots.replay(
         rec.Recording(
             cloth=rec.ClothInfo(areal_density=0.2, sheet=(0.1, 0.1)), provenance="test", grippers={"hand": motion}
@@ -178,6 +178,6 @@ def test_a_pose_is_enough_where_no_arm_is_named(random_q):
 
 
 def test_joints_that_turn_without_end_are_recorded_without_jumps():
-    arm = SimpleNamespace(joint_types=("continuous", "revolute"), checked=lambda q: q)
-    q = unwound(arm, np.array([[3.1, 3.1], [-3.1, -3.1], [3.1, 3.1]]))
+    arm = SimpleNamespace(joint_types=("continuous", "revolute"), validate_joints=lambda q: q)
+    q = unwrap_joints(arm, np.array([[3.1, 3.1], [-3.1, -3.1], [3.1, 3.1]]))
     np.testing.assert_allclose(q, [[3.1, 3.1], [2 * np.pi - 3.1, -3.1], [3.1, 3.1]])

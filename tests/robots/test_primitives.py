@@ -5,14 +5,25 @@ import math
 import pytest
 import torch
 
-from torchcloth.boundaries.motion import check, check_cover, interpolate
+from torchcloth.boundaries.motion import check_covers_times, check_trajectory, interpolate_poses
 from torchcloth.errors import InvalidInput
-from torchcloth.robots.primitives import Limits, cover, drag, fling, fold, hang, minimum_jerk, shake, stretch, swing
-from torchcloth.robots.primitives.base import PERIOD
+from torchcloth.robots.primitives import (
+    GripperLimits,
+    cover,
+    drag,
+    fling,
+    fold,
+    hang,
+    minimum_jerk,
+    shake,
+    stretch,
+    swing,
+)
+from torchcloth.robots.primitives.base import PATH_KNOT_PERIOD_S
 
 TABLE = {"left": (-0.2, 0.3, 0.01), "right": (0.2, 0.3, 0.01)}
 HANGING = {"left": (-0.2, 0.0, 0.6), "right": (0.2, 0.0, 0.6)}
-LIMITS = Limits(0.8, 4.0)
+LIMITS = GripperLimits(0.8, 4.0)
 ACTIONS = {
     "cover": lambda **k: cover(TABLE, 0.5, limits=LIMITS, **k),
     "low cover": lambda **k: cover(TABLE, 0.5, height=0.05, limits=LIMITS, **k),
@@ -62,7 +73,7 @@ def test_the_ablation_gets_the_paths_it_always_had(make, whole, knot, up):
     a = make()
     t, pose, _ = a.motion["right"]
     i = int(0.45 * len(t))
-    assert (len(t), a.duration, a.release) == pytest.approx(whole, rel=1e-13)
+    assert (len(t), a.duration, a.release_time) == pytest.approx(whole, rel=1e-13)
     assert [float(t[i]), *pose[i, :3, 3].tolist()] == pytest.approx(knot, rel=1e-13, abs=1e-16)
     assert pose[i, :3, 2].tolist() == pytest.approx(up, rel=1e-13, abs=1e-16)
 
@@ -70,14 +81,16 @@ def test_the_ablation_gets_the_paths_it_always_had(make, whole, knot, up):
 def fine(action, name="left"):
     """(step, positions [N, 3]) of what the layer makes of the knots."""
     times = torch.linspace(0, action.duration, 20001, dtype=torch.float64)
-    return float(times[1]), interpolate(action.motion[name], times)[:, :3, 3]
+    return float(times[1]), interpolate_poses(action.motion[name], times)[:, :3, 3]
 
 
 def test_the_layer_accepts_it(action):
     for name, trajectory in action.motion.items():
-        check(trajectory, name)
-        check_cover(trajectory, name, 0.0, action.duration)
-    assert float(action.motion["left"].t[:-2].diff().max()) <= PERIOD + 1e-9  # the last two intervals are the rest
+        check_trajectory(trajectory, name)
+        check_covers_times(trajectory, name, 0.0, action.duration)
+    assert (
+        float(action.motion["left"].t[:-2].diff().max()) <= PATH_KNOT_PERIOD_S + 1e-9
+    )  # the last two intervals are the rest
 
 
 def test_speed_stays_within_the_limit_and_reaches_a_limit(action):
@@ -106,13 +119,13 @@ def test_closed_until_release(name):
     made = ACTIONS[name]()
     t, _, closed = made.motion["right"]
     if name in HELD:
-        assert made.release == made.duration
+        assert made.release_time == made.duration
         assert bool(closed.all())
         return
-    assert torch.equal(closed, t < made.release - 1e-9)
+    assert torch.equal(closed, t < made.release_time - 1e-9)
     assert bool(closed[0])
     assert not bool(closed[-1])
-    assert 0 < made.release < made.duration
+    assert 0 < made.release_time < made.duration
 
 
 @pytest.mark.parametrize("name", [name for name in ACTIONS if name != "stretch"])
@@ -136,10 +149,10 @@ def test_cover_turns_the_grip_over_and_lands():
 
 def test_drag_takes_the_least_time_of_a_minimum_jerk_move():
     """Closed form: T = max(15/8 L / v, sqrt(10/sqrt(3) L / a)), here with lift and landing of no height."""
-    for limits in (Limits(0.5, 100.0), Limits(100.0, 2.0)):
+    for limits in (GripperLimits(0.5, 100.0), GripperLimits(100.0, 2.0)):
         a = drag({"left": (0.0, 0.0, 0.05)}, 0.4, heading=0.3, height=0.05, landing=0.05, limits=limits)
         truth = max(15 / 8 * 0.4 / limits.speed, math.sqrt(10 / math.sqrt(3) * 0.4 / limits.acceleration))
-        assert a.release == pytest.approx(truth, rel=1e-4)
+        assert a.release_time == pytest.approx(truth, rel=1e-4)
         end = a.motion["left"].pose[-1, :3, 3]
         torch.testing.assert_close(end, torch.tensor([0.4 * math.cos(0.3), 0.4 * math.sin(0.3), 0.05]))
 
@@ -205,12 +218,12 @@ def test_minimum_jerk_is_at_rest_at_both_ends():
         (lambda: cover(TABLE, 0.5, height=-0.1), "height"),
         (lambda: cover(TABLE, 0.5, rest=float("nan")), "rest"),
         (lambda: drag(TABLE, 0.3, heading=float("inf")), "heading"),
-        (lambda: drag(TABLE, 0.3, limits=Limits(0.0, 1.0)), "speed"),
+        (lambda: drag(TABLE, 0.3, limits=GripperLimits(0.0, 1.0)), "speed"),
         (
-            lambda: drag(TABLE, 0.3, limits=Limits(1e-9, 1.0)),
+            lambda: drag(TABLE, 0.3, limits=GripperLimits(1e-9, 1.0)),
             r"speed or acceleration; got 1e-09 m/s .*; expected at most",
         ),
-        (lambda: drag(TABLE, 0.3, limits=Limits(1.0, 1e-12)), r"speed or acceleration"),
+        (lambda: drag(TABLE, 0.3, limits=GripperLimits(1.0, 1e-12)), r"speed or acceleration"),
         (lambda: drag({}, 0.3), "grips"),
         (lambda: drag({"left": (0.0, float("nan"), 0.1)}, 0.3), "grips"),
         (lambda: drag({"left": (0.0, 0.1)}, 0.3), "grips"),

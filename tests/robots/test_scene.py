@@ -80,7 +80,7 @@ def test_a_table_that_would_be_in_nobodys_way_is_refused(rig, bad):
         robots.Scene({"one": rig["left"]}, robots.scene.Table(**bad))
 
 
-def test_infos_name_model_place_and_tool(rig):
-    info = rig.infos()["right"]
+def test_robot_infos_name_model_place_and_tool(rig):
+    info = rig.robot_infos()["right"]
     assert (info.model, info.tool_frame) == ("rizon4", "tcp_closed")
     assert info.T_world_base[1, 3] == pytest.approx(-0.316)

@@ -19,13 +19,13 @@ def elements(name, tag):
     return list(ET.parse(FOLDER / f"{name}.urdf").getroot().iter(tag))
 
 
-@pytest.fixture(params=robots.models())
+@pytest.fixture(params=robots.list_models())
 def model(request):
     return request.param
 
 
 def test_models():
-    assert robots.models() == ["rizon4", "rizon4_gen2022", "rizon4s"]
+    assert robots.list_models() == ["rizon4", "rizon4_gen2022", "rizon4s"]
 
 
 def test_files_are_what_the_generator_writes(model):
@@ -33,7 +33,7 @@ def test_files_are_what_the_generator_writes(model):
     spec = importlib.util.spec_from_file_location("generate", script)
     generate = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(generate)
-    assert sorted(generate.VARIANTS) == robots.models()
+    assert sorted(generate.VARIANTS) == robots.list_models()
     assert generate.render(model) == (FOLDER / f"{model}.urdf").read_text()
 
 
