@@ -8,10 +8,10 @@ import torch
 from helpers.planning_scenes import by_arm, by_hand, cloth_of
 
 from torchcloth import recordings as rec
-from torchcloth.planning.clearance import clearance_of
+from torchcloth.planning.clearance import build_clearance
 from torchcloth.planning.episode_conversion import extract_motion_parameters
-from torchcloth.robots import ACCELERATION
-from torchcloth.robots.primitives import Limits
+from torchcloth.robots import DEFAULT_JOINT_ACCELERATION
+from torchcloth.robots.primitives import GripperLimits
 
 PALM = 0.212  # m, the lower side of the gripper's body at home
 
@@ -24,26 +24,30 @@ def over(height):
 
 def looked_at(recording, least):
     """(the course, what it is held against, why nothing is)."""
-    courses = extract_motion_parameters(cloth_of(recording), recording, 2, 0.1, ACCELERATION, Limits())
-    return courses[0], *clearance_of(recording, courses, torch.tensor([[0.7, 0.0, 0.0]]), least)
+    courses = extract_motion_parameters(
+        cloth_of(recording), recording, 2, 0.1, DEFAULT_JOINT_ACCELERATION, GripperLimits()
+    )
+    return courses[0], *build_clearance(recording, courses, torch.tensor([[0.7, 0.0, 0.0]]), least)
 
 
 def test_a_motion_into_the_table_is_not_clear():
     course, judge, doubt = looked_at(over(PALM - 0.1), 0.05)
     assert not doubt
     q = course.coordinates_at_check_times(course.zero_waypoints)
-    assert judge.nearest({"arm": q})[1] is None
+    assert judge.smallest_gap({"arm": q})[1] is None
     t = course.span.bound_check_times
     q[:, 1] -= 0.12 * t / t[-1]  # the shoulder leans, the hand goes down by 8 cm
-    gap, refusal = judge.nearest({"arm": q})
+    gap, refusal = judge.smallest_gap({"arm": q})
     assert "the table" in str(refusal)
     assert gap.distance < 0.05
 
 
 def test_the_table_reaches_to_the_goal():
     recording = over(PALM - 0.1)
-    courses = extract_motion_parameters(cloth_of(recording), recording, 2, 0.1, ACCELERATION, Limits())
-    near, far = (clearance_of(recording, courses, torch.tensor([[x, 0.0, 0.0]]), 0.05)[0] for x in (0.6, 1.5))
+    courses = extract_motion_parameters(
+        cloth_of(recording), recording, 2, 0.1, DEFAULT_JOINT_ACCELERATION, GripperLimits()
+    )
+    near, far = (build_clearance(recording, courses, torch.tensor([[x, 0.0, 0.0]]), 0.05)[0] for x in (0.6, 1.5))
     assert far.scene.table.x[1] == pytest.approx(1.6)
     assert near.scene.table.x[1] < 1.0
 

@@ -10,8 +10,8 @@ from helpers.planning_scenes import by_arm, by_hand, cloth_of
 
 from torchcloth import recordings as rec
 from torchcloth.cli import main
-from torchcloth.diagnosis import base_model, save_model
-from torchcloth.diagnosis.causes.hypotheses import known
+from torchcloth.diagnosis import build_base_model, save_model
+from torchcloth.diagnosis.causes.hypotheses import list_known_hypotheses
 from torchcloth.identification import build_episode
 from torchcloth.planning.result import PLANNED_PROVENANCE
 
@@ -62,10 +62,10 @@ def test_writes_what_was_planned(folder, goal, tmp_path, capsys):
     assert planned.joints["arm"].q.shape[1] == 7
     assert (out / "plan.png").stat().st_size > 10_000
     assert sorted(file.name for file in out.iterdir()) == ["episode", "plan.json", "plan.png"]
-    said = capsys.readouterr().out
-    assert "recorded motion" in said
-    assert "nearest solids" in said
-    assert "motion 2:" in said
+    message = capsys.readouterr().out
+    assert "recorded motion" in message
+    assert "nearest solids" in message
+    assert "motion 2:" in message
     assert main(["plan", str(folder), "--goal", str(goal), "--out", str(out), *OPTIONS]) == 0  # over an earlier plan
     assert "replaced" in capsys.readouterr().out
 
@@ -73,8 +73,12 @@ def test_writes_what_was_planned(folder, goal, tmp_path, capsys):
 def test_plans_with_the_model_of_a_diagnosis(folder, goal, planned, tmp_path, capsys):
     """Air that brakes, and a camera that believes itself 3 cm farther along x: the goal is where it sees the cloth."""
     recording = rec.read(folder)
-    named = {h.name: h for h in known()}
-    model = base_model(recording).plus(named["air.drag_n"], 1.2).plus(named["obs.extrinsic[x]"], 0.03)
+    named = {h.name: h for h in list_known_hypotheses()}
+    model = (
+        build_base_model(recording)
+        .with_hypothesis(named["air.drag_n"], 1.2)
+        .with_hypothesis(named["obs.extrinsic[x]"], 0.03)
+    )
     covariance = 0.01 * torch.diag(model.point.new_tensor([1.0] * (len(model.point) - 1) + [1e-6]))
     save_model(tmp_path / "model.tcm", model, recording, covariance)
     arguments = [
@@ -96,7 +100,7 @@ def test_plans_with_the_model_of_a_diagnosis(folder, goal, planned, tmp_path, ca
 
 
 @pytest.mark.parametrize(
-    ("more", "said"),
+    ("more", "message"),
     [
         (["--goal", "nowhere.npy"], "goal"),
         (["--fit", "nowhere"], "nowhere"),
@@ -108,19 +112,19 @@ def test_plans_with_the_model_of_a_diagnosis(folder, goal, planned, tmp_path, ca
     ],
     ids=lambda value: value[0] if isinstance(value, list) else "",
 )
-def test_wrong_input_is_one_line_and_leaves_nothing(folder, goal, tmp_path, capsys, more, said):
+def test_wrong_input_is_one_line_and_leaves_nothing(folder, goal, tmp_path, capsys, more, message):
     out = tmp_path / "out"
     assert main(["plan", str(folder), "--goal", str(goal), "--out", str(out), *OPTIONS, *more]) == 2
     (line,) = capsys.readouterr().err.splitlines()
-    assert said in line
+    assert message in line
     assert not out.exists()
 
 
 def test_what_was_recorded_where_the_plan_would_go_stays(folder, goal, tmp_path, capsys):
-    own = rec.write(by_hand(), tmp_path / "out" / "episode")
-    assert main(["plan", str(folder), "--goal", str(goal), "--out", str(own.parent), *OPTIONS]) == 2
+    custom = rec.write(by_hand(), tmp_path / "out" / "episode")
+    assert main(["plan", str(folder), "--goal", str(goal), "--out", str(custom.parent), *OPTIONS]) == 2
     assert "no earlier plan" in capsys.readouterr().err
-    assert rec.read(own).provenance == by_hand().provenance
+    assert rec.read(custom).provenance == by_hand().provenance
 
 
 def test_what_was_filmed_where_the_plan_would_go_stays(folder, goal, planned, tmp_path, capsys):

@@ -78,13 +78,15 @@ def test_of_pieces_it_counts_which_is_where():
     assert float(build_objective(surface, MESH).distance(over)) == pytest.approx(0.0, abs=1e-9)
     assert float(build_objective(pieces, MESH).distance(over)) == pytest.approx(float((FLAT - over).norm(dim=1).mean()))
     ways = torch.eye(3)[:, None, :].expand(3, len(FLAT), 3)
-    assert build_objective(pieces, MESH).quadratic_model(over, ways).curvature.diagonal().tolist() == pytest.approx([2.0, 2.0, 2.0])
+    assert build_objective(pieces, MESH).quadratic_model(over, ways).curvature.diagonal().tolist() == pytest.approx(
+        [2.0, 2.0, 2.0]
+    )
     corner = Goal(torch.tensor([[0.3, 0.1, 0.0]]), uv=torch.tensor([[0.2, 0.1]]))
     assert float(build_objective(corner, MESH).distance(FLAT)) == pytest.approx(0.1)
 
 
 @pytest.mark.parametrize(
-    ("goal", "said"),
+    ("goal", "message"),
     [
         (Goal(torch.zeros(1, 3), uv=torch.tensor([[0.3, 0.0]])), r"uv of the goal\[0\].*off the cloth"),
         (Goal(torch.zeros(1, 3), vertices=torch.tensor([len(FLAT)])), "vertices of the goal"),
@@ -92,13 +94,13 @@ def test_of_pieces_it_counts_which_is_where():
     ],
     ids=["beyond the pattern", "beyond the mesh", "another mesh"],
 )
-def test_pieces_that_the_cloth_has_not_are_refused(goal, said):
-    with pytest.raises(InvalidInput, match=said):
+def test_pieces_that_the_cloth_has_not_are_refused(goal, message):
+    with pytest.raises(InvalidInput, match=message):
         build_objective(goal, MESH)
 
 
 @pytest.mark.parametrize(
-    ("how", "said"),
+    ("how", "message"),
     [
         ({"uv": torch.zeros(2, 2), "vertices": torch.arange(2)}, "uv and vertices"),
         ({"uv": torch.zeros(3, 2)}, r"uv of the goal.*\[2, 2\]"),
@@ -108,8 +110,8 @@ def test_pieces_that_the_cloth_has_not_are_refused(goal, said):
         ({"uv": "corners"}, "uv of the goal"),
     ],
 )
-def test_pieces_that_are_none_are_refused(how, said):
-    with pytest.raises(InvalidInput, match=said):
+def test_pieces_that_are_none_are_refused(how, message):
+    with pytest.raises(InvalidInput, match=message):
         Goal(torch.zeros(2, 3), **how)
 
 
@@ -138,23 +140,23 @@ def test_files(tmp_path):
 def test_files_of_pieces(tmp_path):
     points = np.random.default_rng(0).normal(size=(5, 3))
     np.savez(tmp_path / "pose.npz", x=np.stack([points, points + 1]), faces=np.array([[0, 1, 2]]))
-    assert read_goal(tmp_path / "pose.npz", pieces=True).vertices.tolist() == [0, 1, 2, 3, 4]
+    assert read_goal(tmp_path / "pose.npz", correspondences=True).vertices.tolist() == [0, 1, 2, 3, 4]
     np.savez(tmp_path / "pieces.npz", x=points, uv=points[:, :2])
     for pieces in (False, True):
-        found = read_goal(tmp_path / "pieces.npz", pieces)
-        assert np.allclose(found.points, points)
-        assert np.allclose(found.uv, points[:, :2])
+        result = read_goal(tmp_path / "pieces.npz", pieces)
+        assert np.allclose(result.points, points)
+        assert np.allclose(result.uv, points[:, :2])
     np.savez(tmp_path / "both.npz", x=np.stack([points, points + 1]), uv=points[:, :2], faces=np.array([[0, 1, 2]]))
     assert np.allclose(read_goal(tmp_path / "both.npz").uv, points[:, :2])
     assert np.allclose(read_goal(tmp_path / "both.npz").points, points + 1)
     lines = [f"v {x} {y} {z}" for x, y, z in MESH.vertices] + [f"vt {u} {v}" for u, v in MESH.uv]
     lines += [f"f {a}/{a} {b}/{b} {c}/{c}" for a, b, c in MESH.faces + 1]
     (tmp_path / "mesh.obj").write_text("\n".join(lines) + "\n")
-    assert np.allclose(read_goal(tmp_path / "mesh.obj", pieces=True).uv, MESH.uv)
+    assert np.allclose(read_goal(tmp_path / "mesh.obj", correspondences=True).uv, MESH.uv)
     np.save(tmp_path / "cloud.npy", points[::-1])
     assert np.allclose(Goal(points[::-1]).points, points[::-1])
-    with pytest.raises(InvalidInput, match="nobody knows the piece"):
-        read_goal(tmp_path / "cloud.npy", pieces=True)
+    with pytest.raises(InvalidInput, match="without pattern coordinates"):
+        read_goal(tmp_path / "cloud.npy", correspondences=True)
 
 
 def test_markers_are_pieces_where_the_last_frame_has_them(tmp_path):
@@ -163,14 +165,14 @@ def test_markers_are_pieces_where_the_last_frame_has_them(tmp_path):
     uv, xyz = np.array([[0.0, 0.0], [0.1, 0.1]]), np.zeros((3, 2, 3))
     xyz[-1] = [[np.nan] * 3, [0.1, 0.2, 0.3]]
     markers = rec.Markers(np.linspace(0, 0.2, 3), xyz, uv)
-    found = read_goal(rec.write(replace(by_hand(), markers=markers), tmp_path / "seen"), pieces=True)
-    assert found.points.tolist() == [[0.1, 0.2, 0.3]]
-    assert found.uv.tolist() == [[0.1, 0.1]]
+    result = read_goal(rec.write(replace(by_hand(), markers=markers), tmp_path / "seen"), correspondences=True)
+    assert result.points.tolist() == [[0.1, 0.2, 0.3]]
+    assert result.uv.tolist() == [[0.1, 0.1]]
     unknown = rec.write(replace(by_hand(), markers=replace(markers, uv=None)), tmp_path / "unknown")
-    with pytest.raises(InvalidInput, match="nobody knows the piece"):
-        read_goal(unknown, pieces=True)
+    with pytest.raises(InvalidInput, match="without pattern coordinates"):
+        read_goal(unknown, correspondences=True)
     with pytest.raises(RecordingError, match="markers"):
-        read_goal(rec.write(by_hand(), tmp_path / "blind"), pieces=True)
+        read_goal(rec.write(by_hand(), tmp_path / "blind"), correspondences=True)
 
 
 def test_triangles_of_other_points_are_refused():

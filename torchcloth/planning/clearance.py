@@ -9,66 +9,80 @@ from torch import Tensor
 from ..errors import InvalidInput
 from ..recordings import Recording
 from ..robots.clearance import Gap  # pyright: ignore[reportMissingImports] - mapped from robots/ at installation
-from ..robots.collision_checks import between_arms, within_arm  # pyright: ignore[reportMissingImports]
-from ..robots.replan_episode import table_of  # pyright: ignore[reportMissingImports]
+from ..robots.collision_checks import (  # pyright: ignore[reportMissingImports]
+    check_between_arms,
+    check_self_and_table,
+)
+from ..robots.replan_episode import (  # pyright: ignore[reportMissingImports]
+    TABLE_MARGIN_M,
+    table_from_episode,
+)
 from ..robots.scene import Scene, Table  # pyright: ignore[reportMissingImports]
-from ..robots.spline import Spline  # pyright: ignore[reportMissingImports]
-from .motion_parameters import ArmCourse, Course
-
-AROUND = 0.1  # m, that the table reaches beyond the goal
+from ..robots.spline import ClampedSpline  # pyright: ignore[reportMissingImports]
+from .motion_parameters import ArmMotionParameters, GripperMotionParameters
 
 
-class Clearance:
-    """The solids of a scene's arms, and how near they may come.
+class ArmClearance:
+    """The solids of a scene's arms and how near they may come to each other.
 
     Args:
         scene: arms and table.
-        least: m, between two arms and between an arm and the table; fingers may come down to that.
-        times: [N] s, the instants at which joint angles are given.
+        min_distance: m, between two arms and between an arm and the table; fingers may touch the table.
+        times: [N] s, the times at which joint angles are given.
     """
 
-    def __init__(self, scene: Scene, least: float, times: Tensor) -> None:
-        self.scene, self.least, self.times = scene, least, times
+    def __init__(self, scene: Scene, min_distance: float, times: Tensor) -> None:
+        self.scene, self.min_distance, self.times = scene, min_distance, times
 
-    def nearest(self, q: Mapping[str, Tensor]) -> tuple[Gap, InvalidInput | None]:
-        """(the smallest distance, what is too near) of joint angles [N, J] by arm."""
-        gaps, refusals = [], []
-        for name, own in q.items():
-            gap, refusal = within_arm(self.scene, name, own, self.times, self.least)
+    def smallest_gap(self, q: Mapping[str, Tensor]) -> tuple[Gap, InvalidInput | None]:
+        """Return the smallest distance along joint angles [N, J] by arm, and an error if one is too small."""
+        gaps, errors = [], []
+        for name, joint_angles in q.items():
+            gap, error = check_self_and_table(self.scene, name, joint_angles, self.times, self.min_distance)
             gaps.append(gap)
-            refusals += [] if refusal is None else [refusal]
-        gap = between_arms(self.scene, {name: Spline.through(self.times, own) for name, own in q.items()}, self.least)
+            errors += [] if error is None else [error]
+        splines = {name: ClampedSpline(self.times, joint_angles) for name, joint_angles in q.items()}
+        gap = check_between_arms(self.scene, splines, self.min_distance)
         gaps.append(gap)
-        refusals += [gap.refusal(self.least)] if gap.distance < self.least else []
-        return min(gaps, key=lambda gap: gap.distance), refusals[0] if refusals else None
+        errors += [gap.to_error(self.min_distance)] if gap.distance < self.min_distance else []
+        return min(gaps, key=lambda gap: gap.distance), errors[0] if errors else None
 
 
-def clearance_of(
-    recording: Recording, courses: Sequence[Course], goal: Tensor, least: float
-) -> tuple[Clearance | None, str]:
-    """(what to hold motions against, why there is nothing); the table reaches to the goal's points [N, 3] m.
+def build_clearance(
+    recording: Recording, motions: Sequence[GripperMotionParameters], goal: Tensor, min_distance: float
+) -> tuple[ArmClearance | None, str]:
+    """Build the clearance check of an episode's arms.
 
-    A recorded motion that comes nearer by our solids was done all the same: then they are no judges.
+    The check is switched off if the recorded motion itself violates it: the robot has executed that motion, so the
+    simplified solids are wrong.
+
+    Args:
+        recording: the episode.
+        motions: of the grippers that hold the cloth.
+        goal: [N, 3] m, points that the table must reach to.
+        min_distance: m, smallest distance allowed.
+
+    Returns:
+        The check, or None and a sentence that says why there is none.
     """
-    arms = {c.name: c.arm for c in courses if isinstance(c, ArmCourse)}
-    if len(arms) < len(courses):
-        return None, "not every gripper that holds the cloth is moved by an arm: whether arms stay clear is not known"
-    if bare := [name for name, arm in arms.items() if arm.unshaped]:
-        return None, f"solids of {bare[0]!r} are meshes: whether the arms stay clear was not looked at"
-    table = table_of(recording)
-    scene = Scene(arms, None if table is None else _reaching(table, goal))
-    found = Clearance(scene, least, courses[0].span.instants)
-    _, refusal = found.nearest({c.name: c.at_instants(c.nothing) for c in courses})
-    if refusal is not None:
-        return (
-            None,
-            f"the recorded motion itself is not clear ({refusal}): whether the planned one is was not looked at",
-        )
-    return found, ""
+    arms = {motion.name: motion.arm for motion in motions if isinstance(motion, ArmMotionParameters)}
+    if len(arms) < len(motions):
+        return None, "arm clearance was not checked: not every gripper that holds the cloth is moved by an arm"
+    if names := [name for name, arm in arms.items() if arm.links_without_primitives]:
+        return None, f"arm clearance was not checked: solids of {names[0]!r} are meshes"
+    table = table_from_episode(recording)
+    scene = Scene(arms, None if table is None else _extend_table(table, goal))
+    clearance = ArmClearance(scene, min_distance, motions[0].span.bound_check_times)
+    _, error = clearance.smallest_gap(
+        {motion.name: motion.coordinates_at_check_times(motion.zero_waypoints) for motion in motions}
+    )
+    if error is not None:
+        return None, f"arm clearance was not checked: the recorded motion itself is not clear ({error})"
+    return clearance, ""
 
 
-def _reaching(table: Table, goal: Tensor) -> Table:
-    """An episode gives a table's plane alone; it ends beyond cloth, paths and goal."""
-    low, high = (goal.amin(0) - AROUND).tolist(), (goal.amax(0) + AROUND).tolist()
-    widened = lambda side, k: (min(side[0], low[k]), max(side[1], high[k]))  # noqa: E731
-    return table._replace(x=widened(table.x, 0), y=widened(table.y, 1))
+def _extend_table(table: Table, goal: Tensor) -> Table:
+    """An episode gives only a table's plane: let the table reach beyond cloth, paths and goal."""
+    low, high = (goal.amin(0) - TABLE_MARGIN_M).tolist(), (goal.amax(0) + TABLE_MARGIN_M).tolist()
+    x, y = ((min(side[0], low[k]), max(side[1], high[k])) for k, side in enumerate((table.x, table.y)))
+    return table._replace(x=x, y=y)

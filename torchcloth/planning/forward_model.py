@@ -1,4 +1,4 @@
-"""The cloth under a motion, as one model has it, from the episode's first shape to the end of the wait."""
+"""The cloth under a motion: simulation from the episode's first shape to the end of the wait, for one cloth model."""
 
 from __future__ import annotations
 
@@ -9,109 +9,143 @@ import torch
 from torch import Tensor
 
 from ..cloth import Cloth
-from ..diagnosis.data.dataset import LATE
-from ..episodes.observed import RATE, Episode, episode
-from ..episodes.replay import SETTLING, Frames, frames_of
-from ..episodes.world import Model, World
+from ..episodes.observed import DEFAULT_FRAME_RATE_HZ, Episode, build_episode
+from ..episodes.replay import SETTLE_TIME_S, Frames, frames_from_rollout
+from ..episodes.world import MAX_CLOCK_DELAY_S, World, WorldModel
 from ..recordings import Recording
 from ..simulation.sensitivities import Directions
 from ..types import ClothState, Trajectory
-from .episode_conversion import held_until
-from .motion_parameters import Course
+from .episode_conversion import extend_at_rest
+from .motion_parameters import GripperMotionParameters
 
-NUDGE = 1e-3  # of a direction, by which what an observer has is differentiated
+DIRECTION_DIFFERENCE_STEP = 1e-3  # finite-difference step along a direction, for errors of robot and observer
 
 
-class Rehearsal:
-    """One model, ready to be run under any motion of the courses.
+class ForwardModel:
+    """A cloth model that is ready to be simulated under any motion of the planned grippers.
 
     Args:
-        model: the cloth, what robots do other than they say, and how it is seen.
-        recording: where the cloth is at first.
-        courses: of the grippers that are planned for; all others move as recorded.
-        dt: s, largest substep.
+        model: the cloth, the errors of the robot and the observer.
+        recording: gives the first shape of the cloth.
+        motions: of the grippers that are planned for; all others move as recorded.
+        dt: s, largest substep; None: the stable one.
     """
 
-    def __init__(self, model: Model, recording: Recording, courses: Sequence[Course], dt: float | None) -> None:
-        self.world, self.dt = model.world(), dt
+    def __init__(
+        self, model: WorldModel, recording: Recording, motions: Sequence[GripperMotionParameters], dt: float | None
+    ) -> None:
+        self.world, self.dt = model.build_world(), dt
         self.world.cloth.requires_grad_(False)
-        self.mesh = model.base.cloth.mesh  # on which an observer has it, whatever patches a grip really holds
+        self.mesh = model.base.cloth.mesh  # the observer's mesh; the simulated one may differ where a grip ends
         self.faces = torch.as_tensor(self.mesh.faces)
-        seen = episode(model.base.cloth, recording, RATE)  # which a world may carry over to a mesh of its own
-        span, last = courses[0].span, float(courses[0].t[-1])
-        count = max(1, round((last - span.begin) * RATE))
+        episode = build_episode(model.base.cloth, recording, DEFAULT_FRAME_RATE_HZ)
+        span, last = motions[0].span, float(motions[0].t[-1])
+        count = max(1, round((last - span.begin) * DEFAULT_FRAME_RATE_HZ))
         self.times = torch.linspace(span.begin, last, count + 1, dtype=torch.float64)
-        late = [last + LATE] if self.world.views else []  # what a late clock sees
-        times = torch.cat([self.times, self.times.new_tensor(late)])
-        nothing = [seen.initial.new_zeros(0, 3)] * len(times)
-        others = {name: held_until(path, float(times[-1])) for name, path in seen.motion.items()}
-        self.blank: Episode = replace(
-            seen, motion=others, times=times, clouds=nothing, markers=None, places=None, wrenches={}, unseen=0
+        delayed = [last + MAX_CLOCK_DELAY_S] if self.world.observation_transforms else []  # what a delayed clock sees
+        times = torch.cat([self.times, self.times.new_tensor(delayed)])
+        no_points = [episode.initial.new_zeros(0, 3)] * len(times)
+        others = {name: extend_at_rest(path, float(times[-1])) for name, path in episode.motion.items()}
+        self.episode_template: Episode = replace(
+            episode,
+            motion=others,
+            times=times,
+            clouds=no_points,
+            markers=None,
+            marker_places=None,
+            wrenches={},
+            unobserved_count=0,
         )
         with torch.no_grad():
-            self._first = self._moved({c.name: c.trajectory(c.nothing) for c in courses})
-            driven = self.world.driven(self._first)
+            self._first = self._commanded({m.name: m.trajectory(m.zero_waypoints) for m in motions})
+            driven = self.world.apply_motion(self._first)
             state = self.world.cloth.state(driven.initial)
-            if driven.settles:  # nothing is added to where grippers are at first, so it is the same under all motions
-                state = self.world.cloth.settle(state, driven.motion, start=span.begin, duration=SETTLING)
+            if (
+                driven.needs_settling
+            ):  # no_points is added to where grippers are at first, so it is the same under all motions
+                state = self.world.cloth.settle(state, driven.motion, start=span.begin, duration=SETTLE_TIME_S)
             self.state = state
 
-    def run(self, motion: Mapping[str, Trajectory]) -> Tensor:
-        """[T, V, 3] m, what an observer has of the cloth under these motions; differentiable in their poses."""
+    def simulate(self, motion: Mapping[str, Trajectory]) -> Tensor:
+        """Return the observed cloth [T, V, 3] m under the given motions; differentiable in their poses."""
         driven = self._driven(motion)
-        rollout = self.world.cloth(self.state, driven.motion, self.blank.times, dt=self.dt)
-        return self._seen(frames_of(rollout), driven)
+        rollout = self.world.cloth(self.state, driven.motion, self.episode_template.times, dt=self.dt)
+        return self._observe(frames_from_rollout(rollout), driven)
 
-    def go_on(self, state: ClothState, motion: Mapping[str, Trajectory], begin: float, end: float) -> ClothState:
-        """The cloth itself at ``end`` [s] under these motions, from what it is at ``begin``."""
+    def simulate_interval(
+        self, state: ClothState, motion: Mapping[str, Trajectory], begin: float, end: float
+    ) -> ClothState:
+        """Return the cloth's state at ``end`` [s] under the given motions, from its state at ``begin`` [s]."""
         return self.world.cloth(state, self._driven(motion).motion, [begin, end], dt=self.dt, checkpoint=False).state
 
-    def last(self, motion: Mapping[str, Trajectory], moved: Mapping[str, Tensor]) -> tuple[Tensor, Tensor]:
-        """([V, 3] m at the end, its derivatives [N, V, 3] where poses change by ``moved`` [N, K, 4, 4])."""
-        driven, along = self._driven(motion), self._tangents(motion, moved)
-        out, way = self.world.cloth.sensitivities(
-            self.state, driven.motion, self.blank.times, along=Directions(motion=along), dt=self.dt
+    def linearise_final_shape(
+        self, motion: Mapping[str, Trajectory], pose_derivatives: Mapping[str, Tensor]
+    ) -> tuple[Tensor, Tensor]:
+        """Return the observed final shape and its derivatives along N directions.
+
+        Args:
+            motion: the poses by gripper.
+            pose_derivatives: [N, K, 4, 4] by gripper, derivatives of the poses along the directions.
+
+        Returns:
+            [V, 3] m and [N, V, 3] m.
+        """
+        driven, along = self._driven(motion), self._motion_tangents(motion, pose_derivatives)
+        rollout, tangent_rollout = self.world.cloth.sensitivities(
+            self.state, driven.motion, self.episode_template.times, along=Directions(motion=along), dt=self.dt
         )
-        plain, moves = frames_of(out), frames_of(way)
-        x = self._seen(plain, driven)[-1]
-        if not self.world.views:
-            return x, moves.x[:, -1]
-        beside = [self._seen(_nudged(plain, moves, k), driven)[-1] for k in range(len(moves.x))]
-        return x, (torch.stack(beside) - x) / NUDGE
+        frames, tangents = frames_from_rollout(rollout), frames_from_rollout(tangent_rollout)
+        x = self._observe(frames, driven)[-1]
+        if not self.world.observation_transforms:
+            return x, tangents.x[:, -1]
+        shifted = [self._observe(_nudged(frames, tangents, k), driven)[-1] for k in range(len(tangents.x))]
+        return x, (torch.stack(shifted) - x) / DIRECTION_DIFFERENCE_STEP
 
     def identity(self) -> list[object]:
-        """What runs depend on beside the cloth and the motion."""
-        return [*self.world.identity(self._first), *self.state[:3], self.dt]
+        """Return everything but the cloth and the motion that simulations depend on."""
+        return [*self.world.fingerprint_parts(self._first), *self.state[:3], self.dt]
 
     def _driven(self, motion: Mapping[str, Trajectory]) -> Episode:
-        return self.world.driven(self._moved(motion))
+        return self.world.apply_motion(self._commanded(motion))
 
-    def _moved(self, motion: Mapping[str, Trajectory]) -> Episode:
-        still = {name: held_until(m, float(self.blank.times[-1])) for name, m in motion.items()}
-        as_cloth = {name: m._replace(pose=m.pose.to(self.blank.initial)) for name, m in still.items()}
-        return replace(self.blank, motion={**self.blank.motion, **as_cloth})
+    def _commanded(self, motion: Mapping[str, Trajectory]) -> Episode:
+        extended = {name: extend_at_rest(m, float(self.episode_template.times[-1])) for name, m in motion.items()}
+        cast = {name: m._replace(pose=m.pose.to(self.episode_template.initial)) for name, m in extended.items()}
+        return replace(self.episode_template, motion={**self.episode_template.motion, **cast})
 
-    def _tangents(self, motion: Mapping[str, Trajectory], moved: Mapping[str, Tensor]) -> dict[str, Tensor]:
-        """Of what robots really do: their errors are not known as formulas, so by small steps where they have any."""
-        plain, count = self._driven(motion).motion, len(next(iter(moved.values())))
-        if not self.world.motions:
-            longer = lambda name: len(plain[name].t) - moved[name].shape[1]  # noqa: E731 - where it stands still
-            held = {name: [own, own[:, -1:].expand(-1, longer(name), 4, 4)] for name, own in moved.items()}
-            return {name: torch.cat(parts, 1).to(self.state.x) for name, parts in held.items()}
+    def _motion_tangents(
+        self, motion: Mapping[str, Trajectory], pose_derivatives: Mapping[str, Tensor]
+    ) -> dict[str, Tensor]:
+        """Tangents of the executed motion; by finite differences if the robot has errors, which are any function."""
+        executed, count = self._driven(motion).motion, len(next(iter(pose_derivatives.values())))
+        if not self.world.motion_transforms:
+            tangents = {}
+            for name, derivatives in pose_derivatives.items():
+                appended = len(executed[name].t) - derivatives.shape[1]  # knots at which the gripper stands still
+                extended = torch.cat([derivatives, derivatives[:, -1:].expand(-1, appended, 4, 4)], 1)
+                tangents[name] = extended.to(self.state.x)
+            return tangents
         steps = []
         for k in range(count):
-            nudged = {name: m._replace(pose=m.pose + NUDGE * moved[name][k]) for name, m in motion.items()}
+            nudged = {
+                name: m._replace(pose=m.pose + DIRECTION_DIFFERENCE_STEP * pose_derivatives[name][k])
+                for name, m in motion.items()
+            }
             steps.append(self._driven(nudged).motion)
-        return {name: torch.stack([(s[name].pose - plain[name].pose) / NUDGE for s in steps]) for name in moved}
+        return {
+            name: torch.stack([(s[name].pose - executed[name].pose) / DIRECTION_DIFFERENCE_STEP for s in steps])
+            for name in pose_derivatives
+        }
 
-    def _seen(self, frames: Frames, driven: Episode) -> Tensor:
-        return self.world.seen(frames, driven).x[: len(self.times)]
-
-
-def plain(cloth: Cloth) -> Model:
-    """A cloth as a model whose robot and observer do as they say; it stays the user's."""
-    return Model(World(cloth), (), torch.zeros(0))
+    def _observe(self, frames: Frames, driven: Episode) -> Tensor:
+        return self.world.observe(frames, driven).x[: len(self.times)]
 
 
-def _nudged(plain: Frames, moves: Frames, k: int) -> Frames:
-    return plain._replace(x=plain.x + NUDGE * moves.x[k], v=plain.v + NUDGE * moves.v[k])
+def exact_model(cloth: Cloth) -> WorldModel:
+    """Return a cloth as a model whose robot and observer have no errors. The cloth is not copied."""
+    return WorldModel(World(cloth), (), torch.zeros(0))
+
+
+def _nudged(frames: Frames, tangents: Frames, k: int) -> Frames:
+    step = DIRECTION_DIFFERENCE_STEP
+    return frames._replace(x=frames.x + step * tangents.x[k], v=frames.v + step * tangents.v[k])

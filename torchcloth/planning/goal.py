@@ -1,4 +1,4 @@
-"""Where the cloth shall be at the end."""
+"""The goal of a motion plan: where the cloth shall be at the end."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from ..losses.shapes import check_triangles
 from ..meshes import load
 from ..recordings import Recording, read
 
-EXPECTED = (
+ACCEPTED_GOALS = (
     "an episode (its last points), .npy [N, 3] of points, .obj or .ply of a mesh, pose.npz, or .npz with x [N, 3] and "
     "uv [N, 2]"
 )
@@ -23,16 +23,18 @@ EXPECTED = (
 
 @dataclass(frozen=True, eq=False)
 class Goal:
-    """Where the cloth shall be: its surface, or, with ``uv`` or ``vertices``, each of some pieces of it.
+    """Where the cloth shall be: its surface or, with ``uv`` or ``vertices``, each of some material points.
 
     Attributes:
         points: [N, 3] m, in the world.
-        faces: [F, 3], triangles of the points where the whole cloth is known; None: what a camera sees of it.
-        uv: [N, 2] m, which point of the pattern shall be at each of these.
-        vertices: [N], which vertex of the cloth's mesh; with ``faces`` the mesh must have the same triangles.
+        faces: [F, 3], triangles of the points if the whole surface is known; None: only points, as a camera sees them.
+        uv: [N, 2] m, pattern coordinates of the material points that shall be at ``points``.
+        vertices: [N], vertices of the cloth's mesh that shall be at ``points``; with ``faces`` the mesh must have the
+            same
+            triangles.
 
     Raises:
-        InvalidInput: other shapes, numbers that are not finite, no points, or pieces told in both ways.
+        InvalidInput: wrong shapes, numbers that are not finite, no points, or material points given in both ways.
     """
 
     points: Tensor
@@ -41,36 +43,36 @@ class Goal:
     vertices: Tensor | None = None
 
     def __post_init__(self) -> None:
-        points, uv = _numbers(self.points, "points of the goal"), _numbers(self.uv, "uv of the goal")
-        faces = _numbers(self.faces, "faces of the goal", whole=True)
-        vertices = _numbers(self.vertices, "vertices of the goal", whole=True)
-        if points is None or points.ndim != 2 or points.shape[1] != 3 or not len(points) or not _finite(points):
-            raise InvalidInput("points of the goal", got=_told(points), expected="[N, 3] finite metres, N >= 1")
+        points, uv = _to_tensor(self.points, "points of the goal"), _to_tensor(self.uv, "uv of the goal")
+        faces = _to_tensor(self.faces, "faces of the goal", whole=True)
+        vertices = _to_tensor(self.vertices, "vertices of the goal", whole=True)
+        if points is None or points.ndim != 2 or points.shape[1] != 3 or not len(points) or not _is_finite(points):
+            raise InvalidInput("points of the goal", got=_describe(points), expected="[N, 3] finite metres, N >= 1")
         if faces is not None:
             check_triangles(faces, len(points))
         if uv is not None and vertices is not None:
             raise InvalidInput("goal", got="uv and vertices", expected="one of them")
-        if uv is not None and (uv.shape != (len(points), 2) or not _finite(uv)):
+        if uv is not None and (uv.shape != (len(points), 2) or not _is_finite(uv)):
             raise InvalidInput(
-                "uv of the goal", got=_told(uv), expected=f"[{len(points)}, 2] finite metres on the pattern"
+                "uv of the goal", got=_describe(uv), expected=f"[{len(points)}, 2] finite metres on the pattern"
             )
         if vertices is not None and vertices.shape != (len(points),):
             raise InvalidInput(
-                "vertices of the goal", got=_told(vertices), expected=f"[{len(points)}], one for each point"
+                "vertices of the goal", got=_describe(vertices), expected=f"[{len(points)}], one for each point"
             )
         for name, value in (("points", points), ("faces", faces), ("uv", uv), ("vertices", vertices)):
             object.__setattr__(self, name, value)
 
 
-def _numbers(given: Any, name: str, whole: bool = False) -> Tensor | None:
-    """Tensor of the default dtype, or of int64 of what is ``whole``."""
+def _to_tensor(given: Any, name: str, whole: bool = False) -> Tensor | None:
+    """Tensor of the default dtype, or of int64 if ``whole``."""
     try:
         if given is None:
             return None
-        found = torch.as_tensor(given if isinstance(given, Tensor) else np.array(given)).detach()
-        if whole and (found.is_floating_point() or found.dtype == torch.bool):
+        tensor = torch.as_tensor(given if isinstance(given, Tensor) else np.array(given)).detach()
+        if whole and (tensor.is_floating_point() or tensor.dtype == torch.bool):
             raise TypeError
-        return found.to(torch.int64 if whole else torch.get_default_dtype())
+        return tensor.to(torch.int64 if whole else torch.get_default_dtype())
     except (TypeError, ValueError, RuntimeError):
         expected = "whole numbers" if whole else "numbers in metres"
         remedy = "of a file or an episode: planning.read_goal(path)"
@@ -79,72 +81,75 @@ def _numbers(given: Any, name: str, whole: bool = False) -> Tensor | None:
         ) from None
 
 
-def _told(numbers: Tensor | None) -> str:
+def _describe(numbers: Tensor | None) -> str:
     if numbers is None:
         return "none"
-    return f"shape {tuple(numbers.shape)}" + ("" if _finite(numbers) else ", not all finite")
+    return f"shape {tuple(numbers.shape)}" + ("" if _is_finite(numbers) else ", not all finite")
 
 
-def _finite(numbers: Tensor) -> bool:
+def _is_finite(numbers: Tensor) -> bool:
     return bool(numbers.isfinite().all())
 
 
-def read_goal(path: str | Path, pieces: bool = False) -> Goal:
-    """A goal from a file or an episode's folder.
+def read_goal(path: str | Path, correspondences: bool = False) -> Goal:
+    """Read a goal from a file or an episode's folder.
 
     Args:
-        path: see ``EXPECTED``.
-        pieces: it says where each piece of the cloth shall be: a mesh by its pattern coordinates, one without and a
-            pose by vertices, which are those of the cloth's mesh; an episode by its last markers. Of ``.npz`` files
-            with ``uv`` always.
+        path: see ``ACCEPTED_GOALS``.
+        correspondences: match material points instead of the surface. A mesh is matched by its pattern coordinates; a
+            mesh without them and a pose by vertices, which are those of the cloth's mesh; an episode by its last
+            markers. ``.npz`` files with ``uv`` are always matched by material points.
 
     Raises:
-        InvalidInput: nothing that shows where a cloth, or each piece of it, is.
-        RecordingError: an episode that cannot be read, or without what is asked for.
+        InvalidInput: the path shows no cloth, or no material points.
+        RecordingError: the episode cannot be read, or lacks what is asked for.
     """
     path = Path(path)
     if path.is_dir():
-        return _of_markers(read(path)) if pieces else _of_points(read(path))
+        return _goal_from_markers(read(path)) if correspondences else _goal_from_points(read(path))
     kind = path.suffix.lower()
     if not path.is_file() or kind not in (".npy", ".npz", ".obj", ".ply"):
         what = "file of an unknown kind" if path.is_file() else "no such file or folder"
-        raise InvalidInput("goal", got=f"{path}, {what}", expected=EXPECTED)
-    if kind == ".npy" and pieces:
-        got, expected = (
-            f"{path}, points of which nobody knows the piece",
-            "a mesh, a pose, markers, or .npz with x and uv",
-        )
-        raise InvalidInput("goal", got=got, expected=expected)
-    own = lambda x: torch.arange(len(x)) if pieces else None  # noqa: E731
+        raise InvalidInput("goal", got=f"{path}, {what}", expected=ACCEPTED_GOALS)
+    if kind == ".npy" and correspondences:
+        got = f"{path}, points without pattern coordinates"
+        raise InvalidInput("goal", got=got, expected="a mesh, a pose, markers, or .npz with x and uv")
     if kind in (".obj", ".ply"):
         mesh = load(path)
-        if pieces and mesh.uv is not None:  # vertices of the cloth's mesh may have been moved to where a grasp ends
+        if (
+            correspondences and mesh.uv is not None
+        ):  # vertices of the cloth's mesh may have been moved to where a grasp ends
             return Goal(torch.as_tensor(mesh.vertices), uv=torch.as_tensor(mesh.uv))
-        return Goal(torch.as_tensor(mesh.vertices), torch.as_tensor(mesh.faces), vertices=own(mesh.vertices))
+        vertices = _vertex_indices(mesh.vertices, correspondences)
+        return Goal(torch.as_tensor(mesh.vertices), torch.as_tensor(mesh.faces), vertices=vertices)
     try:
-        found = np.load(path, allow_pickle=False)
+        content = np.load(path, allow_pickle=False)
         if kind == ".npy":
-            return Goal(torch.as_tensor(np.asarray(found, dtype=float)))
-        x = np.asarray(found["x"], dtype=float)
+            return Goal(torch.as_tensor(np.asarray(content, dtype=float)))
+        x = np.asarray(content["x"], dtype=float)
         x = x[-1] if x.ndim == 3 else x
-        if "uv" in found:
-            return Goal(torch.as_tensor(x), uv=torch.as_tensor(np.asarray(found["uv"], dtype=float)))
-        return Goal(torch.as_tensor(x), torch.as_tensor(found["faces"]), vertices=own(x))
+        if "uv" in content:
+            return Goal(torch.as_tensor(x), uv=torch.as_tensor(np.asarray(content["uv"], dtype=float)))
+        return Goal(torch.as_tensor(x), torch.as_tensor(content["faces"]), vertices=_vertex_indices(x, correspondences))
     except InvalidInput:
         raise
     except Exception as error:  # a damaged archive can raise almost anything
-        raise InvalidInput("goal", got=f"{path} ({type(error).__name__})", expected=EXPECTED) from None
+        raise InvalidInput("goal", got=f"{path} ({type(error).__name__})", expected=ACCEPTED_GOALS) from None
 
 
-def _of_points(seen: Recording) -> Goal:
-    points = seen.require("points", by="a goal")
+def _vertex_indices(points: np.ndarray, correspondences: bool) -> Tensor | None:
+    return torch.arange(len(points)) if correspondences else None
+
+
+def _goal_from_points(recording: Recording) -> Goal:
+    points = recording.require("points", by="a goal")
     return Goal(torch.as_tensor(points.frame(len(points) - 1)))
 
 
-def _of_markers(seen: Recording) -> Goal:
-    markers = seen.require("markers", by="a goal of pieces")
-    there = np.isfinite(markers.xyz[-1]).all(-1)
-    if markers.uv is None or not there.any():
-        got = "markers of which nobody knows the piece" if markers.uv is None else "no marker in the last frame"
+def _goal_from_markers(recording: Recording) -> Goal:
+    markers = recording.require("markers", by="a goal of correspondences")
+    seen_last = np.isfinite(markers.xyz[-1]).all(-1)
+    if markers.uv is None or not seen_last.any():
+        got = "markers without pattern coordinates" if markers.uv is None else "no marker in the last frame"
         raise InvalidInput("goal", got=got, expected="markers with uv, of which some are seen at the end")
-    return Goal(torch.as_tensor(markers.xyz[-1][there]), uv=torch.as_tensor(markers.uv[there]))
+    return Goal(torch.as_tensor(markers.xyz[-1][seen_last]), uv=torch.as_tensor(markers.uv[seen_last]))

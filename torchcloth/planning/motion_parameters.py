@@ -1,187 +1,212 @@
-"""What may be added to the motion of a gripper: joint angles of its arm, or shifts and turns of a free hand.
+"""Parametrised changes of a gripper's motion: joint angles of its arm, or shifts and turns of a free gripper.
 
-Added is a cubic spline through waypoints at even times, at rest at both ends (C2), so everything below is linear in the
-waypoints: position, velocity and acceleration at any instant, and with them the limits.
+A cubic spline through evenly spaced waypoints is added to the recorded motion. It is at rest at both ends (C2).
+Position, velocity and acceleration at any time are therefore linear in the waypoints, and so are the limits.
 """
 
 from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
 from typing import NamedTuple
 
-import numpy as np
 import torch
 from scipy.interpolate import PchipInterpolator
 from torch import Tensor
 
 from ..recordings import JointMotion
 from ..robots import Arm  # pyright: ignore[reportMissingImports] - mapped from robots/ at installation
-from ..robots.primitives import Limits  # pyright: ignore[reportMissingImports]
-from ..robots.spline import Spline  # pyright: ignore[reportMissingImports]
+from ..robots.primitives import GripperLimits  # pyright: ignore[reportMissingImports]
+from ..robots.spline import ClampedSpline  # pyright: ignore[reportMissingImports]
 from ..types import Trajectory
-from .deceleration import Halt
+from .deceleration import Deceleration
 
-PERIOD = 0.02  # s, between the instants at which limits are held
-OVER = 3  # periods to either side, over which a recorded motion's accelerations are taken: measured joints tremble
-NUDGE = 1e-4  # s, by which what is added, which is smooth, is differentiated
-TURNING = Limits(speed=2.0, acceleration=10.0)  # rad/s and rad/s^2, of what a hand that no arm moves is turned more
-ORDERS = ("position", "velocity", "acceleration")
-MET = 1e-12  # of room: there is none
+BOUND_CHECK_PERIOD_S = 0.02  # largest time between two checks of the limits
+RECORDED_ACCELERATION_PERIODS = 3  # step of the finite differences of a recorded motion; measured joints tremble
+SPLINE_DIFFERENCE_STEP_S = 1e-4  # step of the finite differences of the added spline, which is smooth
+FREE_GRIPPER_TURN_LIMITS = GripperLimits(speed=2.0, acceleration=10.0)  # rad/s and rad/s^2, of an added rotation
+DERIVATIVE_NAMES = ("position", "velocity", "acceleration")
+MIN_ROOM_TO_LIMIT = 1e-12  # a smaller distance to a limit counts as none
 
 
-class Span(NamedTuple):
-    """Times of what is added."""
+class SplineSpan(NamedTuple):
+    """The times of the added spline.
 
-    begin: float  # s, from which on something is
-    end: float  # s, after which nothing changes any more
-    waypoints: int  # after the beginning, where nothing is added
-    halting: float = 0.0  # s after the end, in which what was recorded under way comes to rest
+    Attributes:
+        begin: s, start of the spline, where nothing is added.
+        end: s, after which the added value is constant.
+        waypoints: number of waypoints after ``begin``.
+        deceleration_time: s after ``end``, in which a recorded motion that is under way comes to rest.
+    """
+
+    begin: float
+    end: float
+    waypoints: int
+    deceleration_time: float = 0.0
 
     def basis(self, times: Tensor) -> Tensor:
-        """[N, K], what each waypoint adds at ``times`` [N] s."""
-        each = torch.cat([torch.zeros(1, self.waypoints), torch.eye(self.waypoints)]).double()
-        return Spline.through(self.knots, each).at(times.double().clamp(self.begin, self.end))[0]
+        """Return how much each waypoint adds: [N, K] at ``times`` [N] s."""
+        unit = torch.cat([torch.zeros(1, self.waypoints), torch.eye(self.waypoints)]).double()
+        return ClampedSpline(self.knots, unit).positions(times.double().clamp(self.begin, self.end))
 
     @property
     def knots(self) -> Tensor:
-        """[K + 1] s, of the beginning and of the waypoints."""
+        """Times [K + 1] s of the beginning and of the waypoints."""
         return torch.linspace(self.begin, self.end, self.waypoints + 1, dtype=torch.float64)
 
     @property
-    def instants(self) -> Tensor:
-        """[N] s, where limits are held: those of the waypoints, where accelerations are greatest, among them."""
-        count = math.ceil((self.end - self.begin) / PERIOD) + 1
+    def bound_check_times(self) -> Tensor:
+        """Times [N] s at which limits are checked; they include the waypoints, where accelerations are largest."""
+        count = math.ceil((self.end - self.begin) / BOUND_CHECK_PERIOD_S) + 1
         even = torch.linspace(self.begin, self.end, count, dtype=torch.float64)
-        after = self.end + torch.linspace(0.0, self.halting, math.ceil(self.halting / PERIOD) + 1, dtype=torch.float64)
+        count = math.ceil(self.deceleration_time / BOUND_CHECK_PERIOD_S) + 1
+        after = self.end + torch.linspace(0.0, self.deceleration_time, count, dtype=torch.float64)
         return torch.cat([even, self.knots, after]).unique()
 
 
-class Bounds(NamedTuple):
-    """low <= rows @ unknowns <= high: limits of positions, velocities, accelerations; to add nothing is within."""
+class LinearBounds(NamedTuple):
+    """Limits of positions, velocities and accelerations: low <= rows @ unknowns <= high. Zero unknowns satisfy them.
 
-    rows: Tensor  # [R, N]
-    low: Tensor  # [R]
-    high: Tensor  # [R]
-    names: list[str]  # [R], what each is about
-    group: Tensor  # [R] int64, which coordinate of which gripper a row is about,
-    groups: Tensor  # [N] int64, and an unknown belongs to: no row is about two of them
+    Attributes:
+        rows: [R, N], coefficients.
+        low: [R], lower limits.
+        high: [R], upper limits.
+        names: R names, what each row limits.
+    """
+
+    rows: Tensor
+    low: Tensor
+    high: Tensor
+    names: list[str]
 
     @staticmethod
-    def of(courses: Sequence[Course]) -> Bounds:
-        """All of several courses, whose waypoints [K, C] follow each other flat."""
-        every = [course.bounds() for course in courses]
-        rows = torch.block_diag(*(b.rows for b in every))
-        low, high = (torch.cat([getattr(b, end) for b in every]) for end in ("low", "high"))
-        first = np.cumsum([0, *(int(b.groups.max()) + 1 for b in every)]).tolist()
-        group, groups = (
-            torch.cat([k + getattr(b, end) for k, b in zip(first, every, strict=False)]) for end in ("group", "groups")
-        )
-        return Bounds(rows, low, high, [name for b in every for name in b.names], group, groups)
+    def concatenate(motions: Sequence[GripperMotionParameters]) -> LinearBounds:
+        """Join the limits of several grippers, whose waypoints [K, C] follow each other, flattened."""
+        parts = [motion.bounds() for motion in motions]
+        rows = torch.block_diag(*(b.rows for b in parts))
+        low, high = torch.cat([b.low for b in parts]), torch.cat([b.high for b in parts])
+        return LinearBounds(rows, low, high, [name for b in parts for name in b.names])
 
-    def nearest(self, at: Tensor) -> tuple[float, str]:
-        """(share of the way to the first limit, from where nothing is added; whose limit of what)."""
-        reached = self.rows @ at
-        room = self.high.where(reached > 0, -self.low)
-        share = (reached.abs() / room.clamp(min=MET)).where(reached.abs() > MET, 0.0)
-        first = int(share.argmax())
-        return min(float(share[first]), 1.0), self.names[first]
+    def nearest_limit(self, at: Tensor) -> tuple[float, str]:
+        """Return the fraction of the way from zero unknowns to the first limit, and the name of that limit."""
+        value = self.rows @ at
+        room = self.high.where(value > 0, -self.low)
+        fraction = (value.abs() / room.clamp(min=MIN_ROOM_TO_LIMIT)).where(value.abs() > MIN_ROOM_TO_LIMIT, 0.0)
+        first = int(fraction.argmax())
+        return min(float(fraction[first]), 1.0), self.names[first]
 
 
 @dataclass(frozen=True, eq=False)
-class Course(ABC):
-    """The motion of one gripper, to which [K, C] waypoints may be added.
+class GripperMotionParameters(ABC):
+    """The motion of one gripper, to which waypoints [K, C] of C coordinates may be added.
 
     Attributes:
         name: of the gripper.
-        t: [S] s, knots as recorded, and of the wait after them.
-        closed: [S] bool.
-        span: when something is added.
-        halt: how the recorded motion ends.
+        t: [S] s, knots of the recorded motion and of the wait after it.
+        closed: [S] bool, whether the gripper holds the cloth from this knot on.
+        span: the times of the added spline.
+        deceleration: how the recorded motion comes to rest after its end.
     """
 
     name: str
     t: Tensor
     closed: Tensor
-    span: Span
-    halt: Halt
+    span: SplineSpan
+    deceleration: Deceleration
+    _knot_basis: Tensor = field(init=False, repr=False)
+
+    def __post_init__(self) -> None:
+        # Computed here, because numpy cannot read tensors inside a function transform such as jacfwd.
+        object.__setattr__(self, "_knot_basis", self.span.basis(self.t))
 
     @property
     @abstractmethod
-    def start(self) -> Tensor:
-        """[S, C], coordinates as recorded."""
+    def recorded_coordinates(self) -> Tensor:
+        """Coordinates [S, C] of the recorded motion."""
 
     @abstractmethod
     def trajectory(self, waypoints: Tensor) -> Trajectory:
-        """The poses with these [K, C] added; differentiable."""
+        """Return the poses with the waypoints [K, C] added; differentiable."""
 
     @property
     @abstractmethod
-    def labels(self) -> list[str]:
-        """[C] names of the coordinates."""
+    def coordinate_names(self) -> list[str]:
+        """Names of the C coordinates."""
 
     @abstractmethod
     def _limits(self) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """[C] each: least and largest coordinate, fastest, hardest acceleration."""
+        """Smallest and largest value, largest speed and largest acceleration of each coordinate, [C] each."""
 
     @property
-    def nothing(self) -> Tensor:
-        """[K, C] waypoints that add nothing."""
-        return torch.zeros(self.span.waypoints, self.start.shape[1], dtype=torch.float64)
+    def zero_waypoints(self) -> Tensor:
+        """Waypoints [K, C] that add nothing."""
+        return torch.zeros(self.span.waypoints, self.recorded_coordinates.shape[1], dtype=torch.float64)
 
     def coordinates(self, waypoints: Tensor) -> Tensor:
-        """[S, C] with these [K, C] added."""
-        return self.start + self.span.basis(self.t) @ waypoints
+        """Return the coordinates [S, C] at the knots with the waypoints [K, C] added."""
+        return self.recorded_coordinates + self._knot_basis @ waypoints
 
-    def at_instants(self, waypoints: Tensor) -> Tensor:
-        """[N, C] of ``span.instants`` with these [K, C] added."""
-        at = self.span.instants
-        return between(self.t, self.start, at) + self.span.basis(at) @ waypoints
+    def coordinates_at_check_times(self, waypoints: Tensor) -> Tensor:
+        """Return the coordinates [N, C] at ``span.bound_check_times`` with the waypoints [K, C] added."""
+        times = self.span.bound_check_times
+        return interpolate_monotone(self.t, self.recorded_coordinates, times) + self.span.basis(times) @ waypoints
 
-    def bounds(self) -> Bounds:
-        """Within the limits, or within what the recorded motion does where that is beyond them."""
-        least, largest, fastest, hardest = self._limits()
-        eye, parts = torch.eye(self.start.shape[1], dtype=torch.float64), []
+    def bounds(self) -> LinearBounds:
+        """Return the limits of the waypoints; where the recorded motion exceeds a limit, its own value is the limit."""
+        smallest, largest, speed, acceleration = self._limits()
+        identity, parts = torch.eye(self.recorded_coordinates.shape[1], dtype=torch.float64), []
         begin, end = self.span.begin, self.span.end
-        every, recorded = self.span.instants, lambda times: between(self.t, self.start, times)
-        for order, ends in ((0, (least, largest)), (1, (-fastest, fastest)), (2, (-hardest, hardest))):
-            step = PERIOD if order < 2 else OVER * PERIOD
-            at = every if order == 0 else every[every <= end]  # then it halts, no faster or harder than it may
-            within = at if order == 0 else at.clamp(begin + step, end - step)  # neither what came before, nor the halt
-            before = _derivative(recorded, within, order, step)
-            inside = at.clamp(begin + NUDGE, end - NUDGE)  # at its ends accelerations are greatest
-            more = _derivative(self.span.basis, inside if order == 2 else at, order, NUDGE)
-            low, high = (ends[0] - before).clamp(max=0.0), (ends[1] - before).clamp(min=0.0)
-            names = [f"{ORDERS[order]} of {label} of {self.name}" for label in self.labels] * len(at)
-            parts.append((torch.kron(more, eye), low.flatten(), high.flatten(), names))
-        rows, low, high, names = zip(*parts, strict=True)
-        numbers, told = torch.arange(len(eye)), [name for own in names for name in own]
-        group, groups = numbers.repeat(len(told) // len(eye)), numbers.repeat(self.span.waypoints)
-        return Bounds(torch.cat(rows), torch.cat(low), torch.cat(high), told, group, groups)
+        check_times = self.span.bound_check_times
+
+        def recorded(times: Tensor) -> Tensor:
+            return interpolate_monotone(self.t, self.recorded_coordinates, times)
+
+        for order, (low, high) in enumerate(((smallest, largest), (-speed, speed), (-acceleration, acceleration))):
+            step = BOUND_CHECK_PERIOD_S if order < 2 else RECORDED_ACCELERATION_PERIODS * BOUND_CHECK_PERIOD_S
+            # After the end the gripper decelerates within its limits, so only positions are checked there.
+            times = check_times if order == 0 else check_times[check_times <= end]
+            # Finite differences use neither the motion before the first frame nor the deceleration.
+            recorded_value = _derivative(
+                recorded, times if order == 0 else times.clamp(begin + step, end - step), order, step
+            )
+            # Accelerations of the spline are largest at its ends.
+            inside = times.clamp(begin + SPLINE_DIFFERENCE_STEP_S, end - SPLINE_DIFFERENCE_STEP_S)
+            basis = _derivative(self.span.basis, inside if order == 2 else times, order, SPLINE_DIFFERENCE_STEP_S)
+            low, high = (low - recorded_value).clamp(max=0.0), (high - recorded_value).clamp(min=0.0)
+            names = [f"{DERIVATIVE_NAMES[order]} of {label} of {self.name}" for label in self.coordinate_names]
+            parts.append((torch.kron(basis, identity), low.flatten(), high.flatten(), names * len(times)))
+        rows, lows, highs, names = zip(*parts, strict=True)
+        return LinearBounds(torch.cat(rows), torch.cat(lows), torch.cat(highs), [n for part in names for n in part])
 
 
 @dataclass(frozen=True, eq=False)
-class ArmCourse(Course):
-    """Joint angles [rad] (or m) of an arm, within its soft limits."""
+class ArmMotionParameters(GripperMotionParameters):
+    """Joint angles [rad] (or [m]) of an arm, within its soft limits.
+
+    Attributes:
+        arm: the kinematics.
+        q: [S, J] rad, recorded joint angles.
+        max_acceleration: rad/s^2, of any joint.
+    """
 
     arm: Arm
-    q: Tensor  # [S, J]
-    acceleration: float  # rad/s^2, at most
+    q: Tensor
+    max_acceleration: float
 
     @property
-    def start(self) -> Tensor:
-        """[S, J] rad."""
+    def recorded_coordinates(self) -> Tensor:
+        """Joint angles [S, J] rad of the recorded motion."""
         return self.q
 
     @property
-    def labels(self) -> list[str]:
-        """Of the joints."""
+    def coordinate_names(self) -> list[str]:
+        """Names of the joints."""
         return list(self.arm.joint_names)
 
     def trajectory(self, waypoints: Tensor) -> Trajectory:
-        """Through the arm's kinematics."""
+        """Return the poses by the arm's kinematics, with the waypoints [K, J] added; differentiable."""
         return Trajectory(self.t, self.arm(self.coordinates(waypoints)), self.closed)
 
     def _limits(self) -> tuple[Tensor, Tensor, Tensor, Tensor]:
@@ -190,63 +215,77 @@ class ArmCourse(Course):
             limits.soft_lower,
             limits.soft_upper,
             limits.velocity,
-            torch.full_like(limits.velocity, self.acceleration),
+            torch.full_like(limits.velocity, self.max_acceleration),
         )
 
-    def joints(self, waypoints: Tensor) -> JointMotion:
-        """As a recording stores it."""
+    def joint_motion(self, waypoints: Tensor) -> JointMotion:
+        """Return the joint angles with the waypoints [K, J] added, as a recording stores them."""
         q = self.coordinates(waypoints).detach().numpy()
         return JointMotion(self.t.numpy(), q, closed=self.closed.numpy())
 
 
 @dataclass(frozen=True, eq=False)
-class HandCourse(Course):
-    """Shifts [m] and turns [rad, a rotation vector in world axes] of a gripper that no arm is named for."""
+class FreeGripperMotionParameters(GripperMotionParameters):
+    """Shifts [m] and rotations [rad, a rotation vector in world axes] of a gripper without an arm.
 
-    pose: Tensor  # [S, 4, 4] m
-    limits: Limits  # of the shifts along each axis
-    lowest: float  # m, of its origin: a table
+    Attributes:
+        pose: [S, 4, 4] m, recorded poses.
+        limits: of the shifts along each axis.
+        min_height: m, lowest height of the gripper's origin: the table, or lower where the recording is.
+    """
+
+    pose: Tensor
+    limits: GripperLimits
+    min_height: float
 
     @property
-    def start(self) -> Tensor:
-        """[S, 6]: places, and no turn."""
+    def recorded_coordinates(self) -> Tensor:
+        """Positions [m] and zero rotations of the recorded motion, [S, 6]."""
         return torch.cat([self.pose[:, :3, 3], torch.zeros_like(self.pose[:, :3, 3])], 1)
 
     @property
-    def labels(self) -> list[str]:
-        """Of shifts and turns."""
+    def coordinate_names(self) -> list[str]:
+        """Names of the three shifts and the three rotations."""
         return ["x", "y", "z", "turn about x", "turn about y", "turn about z"]
 
     def trajectory(self, waypoints: Tensor) -> Trajectory:
-        """Shifted, and turned about the gripper's origin."""
+        """Return the poses with the waypoints [K, 6] added; differentiable.
+
+        Rotations are about the gripper's origin.
+        """
         place, turn = self.coordinates(waypoints).split(3, dim=1)
-        top = torch.cat([rotation(turn) @ self.pose[:, :3, :3], place[:, :, None]], dim=2)
+        top = torch.cat([rotation_matrix(turn) @ self.pose[:, :3, :3], place[:, :, None]], dim=2)
         return Trajectory(self.t, torch.cat([top, self.pose[:, 3:]], dim=1), self.closed)
 
     def _limits(self) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        far = torch.full((6,), math.inf, dtype=torch.float64)
-        least = -far
-        least[2] = self.lowest
-        speed, hardest = ([a] * 3 + [b] * 3 for a, b in zip(self.limits, TURNING, strict=True))
-        return least, far, torch.tensor(speed).double(), torch.tensor(hardest).double()
+        infinite = torch.full((6,), math.inf, dtype=torch.float64)
+        smallest = -infinite
+        smallest[2] = self.min_height
+        speed, acceleration = ([a] * 3 + [b] * 3 for a, b in zip(self.limits, FREE_GRIPPER_TURN_LIMITS, strict=True))
+        return smallest, infinite, torch.tensor(speed).double(), torch.tensor(acceleration).double()
 
 
-def rotation(turn: Tensor) -> Tensor:
-    """[..., 3, 3] of rotation vectors [..., 3] rad."""
+def rotation_matrix(turn: Tensor) -> Tensor:
+    """Return the rotation matrices [..., 3, 3] of rotation vectors [..., 3] rad; differentiable."""
     x, y, z = turn.unbind(-1)
     zero = torch.zeros_like(x)
     rows = [torch.stack(row, -1) for row in ((zero, -z, y), (z, zero, -x), (-y, x, zero))]
     return torch.linalg.matrix_exp(torch.stack(rows, -2))
 
 
-def between(t: Tensor, values: Tensor, times: Tensor) -> Tensor:
-    """[N, C] at ``times`` [N] of values [S, C] at ``t`` [S]: cubics without overshoot (C1), held beyond the ends."""
+def interpolate_monotone(t: Tensor, values: Tensor, times: Tensor) -> Tensor:
+    """Return values [N, C] at ``times`` [N] s by monotone cubic interpolation (PCHIP, C1, no overshoot).
+
+    Args:
+        t: [S] s, knots.
+        values: [S, C].
+        times: [N] s; values beyond the ends are those at the ends.
+    """
     curve = PchipInterpolator(t.numpy(), values.detach().double().numpy(), axis=0)
     return torch.as_tensor(curve(times.clamp(float(t[0]), float(t[-1])).numpy()))
 
 
-def _derivative(function, times: Tensor, order: int, step: float) -> Tensor:
-    """[N, C] of a function of times, by differences."""
+def _derivative(function: Callable[[Tensor], Tensor], times: Tensor, order: int, step: float) -> Tensor:
     if order == 0:
         return function(times)
     if order == 1:

@@ -1,4 +1,4 @@
-"""How far a cloth is from its goal, and what pulls it there."""
+"""The distance of a cloth from its goal, and a local quadratic model of it."""
 
 from __future__ import annotations
 
@@ -9,146 +9,165 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from ..episodes.streams import on_pattern
+from ..episodes.streams import locate_on_pattern
 from ..errors import InvalidInput
-from ..losses import Hits, chamfer_to_surface, closest
+from ..losses import ClosestPoints, chamfer_to_surface, find_closest_points
 from ..meshes import Mesh
 from .goal import Goal
 
-ALONG = 0.1  # of the stiffness across a surface, that a place on it is asked for along it: cloth may slide there
+TANGENTIAL_STIFFNESS_RATIO = 0.1  # curvature along a surface over that across it: cloth may slide along the goal
 
 
-class Pull(NamedTuple):
-    """Mean square distance from the goal, and what a change of the cloth does to it."""
+class QuadraticModel(NamedTuple):
+    """Local quadratic model of the mean square distance along N directions of change.
+
+    Attributes:
+        value: m^2, mean square distance.
+        gradient: [N], m^2 per unit of each direction.
+        curvature: [N, N], positive semi-definite (Gauss-Newton). Offsets along a surface count by
+            ``TANGENTIAL_STIFFNESS_RATIO``.
+    """
 
     value: Tensor  # m^2
     gradient: Tensor  # [N] m^2 for each unit of N directions
-    curvature: Tensor  # [N, N], never negative: slopes alone, places on the surfaces held along them by ``ALONG``
+    curvature: (
+        Tensor  # [N, N], never negative: slopes alone, closest_points on the surfaces held along them by ``ALONG``
+    )
 
 
-def mean(pulls: Sequence[Pull]) -> Pull:
-    """Of several."""
-    return Pull(*(torch.stack(parts).mean(0) for parts in zip(*pulls, strict=True)))
+def average_models(models: Sequence[QuadraticModel]) -> QuadraticModel:
+    """Return the mean of several quadratic models."""
+    return QuadraticModel(*(torch.stack(parts).mean(0) for parts in zip(*models, strict=True)))
 
 
-class AbstractAim(ABC):
-    """A goal, of the cloth on one mesh."""
+class AbstractObjective(ABC):
+    """The distance of a cloth on one mesh from a goal."""
 
     @abstractmethod
     def distance(self, x: Tensor) -> Tensor:
-        """m, between the goal and a cloth [V, 3] m; differentiable."""
+        """Return the mean distance [m] between the goal and a cloth [V, 3] m; differentiable."""
 
     @abstractmethod
-    def square(self, x: Tensor) -> float:
-        """m^2, as ``distance`` with squares; what ``pull`` is about."""
+    def mean_square(self, x: Tensor) -> float:
+        """Return the mean square distance [m^2] between the goal and a cloth [V, 3] m."""
 
     @abstractmethod
-    def pull(self, x: Tensor, moved: Tensor) -> Pull:
-        """What the cloth's changes ``moved`` [N, V, 3] m, along N directions, do to its mean square distance."""
+    def quadratic_model(self, x: Tensor, directions: Tensor) -> QuadraticModel:
+        """Return the quadratic model of ``mean_square`` at a cloth [V, 3] m.
+
+        Args:
+            x: [V, 3] m, the cloth.
+            directions: [N, V, 3] m, changes of the cloth along N directions.
+        """
 
 
-class SurfaceAim(AbstractAim):
+class SurfaceObjective(AbstractObjective):
     """The cloth's surface shall be at the goal.
 
-    What a camera does not see says nothing of where the cloth may not be, so its points are asked for one way only.
+    If only points of the goal are known, only their distances from the cloth count: a camera does not show where the
+    cloth may not be.
     """
 
-    def __init__(self, points: Tensor, faces: Tensor | None, of: Tensor) -> None:
-        self.points, self.faces, self.of = points, faces, of
+    def __init__(self, points: Tensor, faces: Tensor | None, cloth_faces: Tensor) -> None:
+        self.points, self.faces, self.cloth_faces = points, faces, cloth_faces
 
     def distance(self, x: Tensor) -> Tensor:
-        """The mean distance of the goal's points from the cloth's surface (one-sided Chamfer, as in reports of fits).
+        """Return the mean distance [m] of the goal's points from the cloth's surface (one-sided Chamfer).
 
-        Where the goal's surface is known, the mean of that and of the distance of the cloth's vertices from it.
+        If the goal's surface is known, average this with the mean distance of the cloth's vertices from it.
         """
         points = self.points.to(x)
-        there = chamfer_to_surface(points, x, self.of)
+        to_goal = chamfer_to_surface(points, x, self.cloth_faces)
         if self.faces is None:
-            return there
-        return 0.5 * (there + chamfer_to_surface(x, points, self.faces))
+            return to_goal
+        return 0.5 * (to_goal + chamfer_to_surface(x, points, self.faces))
 
-    def square(self, x: Tensor) -> float:
-        """Likewise, of squares."""
+    def mean_square(self, x: Tensor) -> float:
+        """Return the same with squared distances [m^2]."""
         points = self.points.to(x)
-        there = _offsets(points, x, self.of)[0].square().sum(1).mean()
+        to_goal = _offsets(points, x, self.cloth_faces)[0].square().sum(1).mean()
         if self.faces is None:
-            return float(there)
-        return 0.5 * float(there + _offsets(x, points, self.faces)[0].square().sum(1).mean())
+            return float(to_goal)
+        return 0.5 * float(to_goal + _offsets(x, points, self.faces)[0].square().sum(1).mean())
 
-    def pull(self, x: Tensor, moved: Tensor) -> Pull:
-        """The gradient is exact (nearest places are held: envelope theorem); the curvature is Gauss and Newton's."""
+    def quadratic_model(self, x: Tensor, directions: Tensor) -> QuadraticModel:
+        """Return the quadratic model with an exact gradient (envelope theorem) and the Gauss-Newton curvature."""
         points = self.points.to(x)
-        offset, stiff, hits = _offsets(points, x, self.of)
-        there = _pull(offset, stiff, hits.on(moved))
+        offset, stiffness, hits = _offsets(points, x, self.cloth_faces)
+        to_goal = _quadratic_model(offset, stiffness, hits.interpolate(directions))
         if self.faces is None:
-            return there
-        offset, stiff, _ = _offsets(x, points, self.faces)
-        return mean([there, _pull(-offset, stiff, moved)])
+            return to_goal
+        offset, stiffness, _ = _offsets(x, points, self.faces)
+        return average_models([to_goal, _quadratic_model(-offset, stiffness, directions)])
 
 
-class PiecesAim(AbstractAim):
-    """Each of some pieces of the cloth shall be at its point: mean distances."""
+class MaterialPointObjective(AbstractObjective):
+    """Each of some material points of the cloth shall be at its own goal point."""
 
-    def __init__(self, points: Tensor, places: Hits) -> None:
-        self.points, self.places = points, places
+    def __init__(self, points: Tensor, closest_points: ClosestPoints) -> None:
+        self.points, self.closest_points = points, closest_points
 
     def distance(self, x: Tensor) -> Tensor:
-        """The mean distance of the pieces from where they shall be."""
+        """Return the mean distance [m] of the material points from their goal points."""
         return self._offsets(x).norm(dim=1).mean()
 
-    def square(self, x: Tensor) -> float:
-        """Likewise, of squares."""
+    def mean_square(self, x: Tensor) -> float:
+        """Return the mean square distance [m^2] of the material points from their goal points."""
         return float(self._offsets(x).square().sum(1).mean())
 
-    def pull(self, x: Tensor, moved: Tensor) -> Pull:
-        """No piece slides."""
-        stiff = torch.eye(3).to(x).expand(len(self.points), 3, 3)
-        return _pull(self._offsets(x), stiff, self._on(moved))
+    def quadratic_model(self, x: Tensor, directions: Tensor) -> QuadraticModel:
+        """Return the quadratic model; material points do not slide."""
+        stiffness = torch.eye(3).to(x).expand(len(self.points), 3, 3)
+        return _quadratic_model(self._offsets(x), stiffness, self._interpolate(directions))
 
     def _offsets(self, x: Tensor) -> Tensor:
-        return self.points.to(x) - self._on(x)
+        return self.points.to(x) - self._interpolate(x)
 
-    def _on(self, x: Tensor) -> Tensor:
-        return self.places._replace(weights=self.places.weights.to(x)).on(x)
+    def _interpolate(self, x: Tensor) -> Tensor:
+        return self.closest_points._replace(weights=self.closest_points.weights.to(x)).interpolate(x)
 
 
-def aim_at(goal: Goal, mesh: Mesh) -> AbstractAim:
-    """The goal of a cloth on this mesh.
+def build_objective(goal: Goal, mesh: Mesh) -> AbstractObjective:
+    """Build the objective of a goal for the cloth on a mesh.
 
     Raises:
-        InvalidInput: pieces that this cloth has not.
+        InvalidInput: the goal names material points that this cloth does not have.
     """
     if goal.uv is not None:
-        return PiecesAim(goal.points, on_pattern(mesh, goal.uv.cpu().numpy(), "uv of the goal"))
+        return MaterialPointObjective(goal.points, locate_on_pattern(mesh, goal.uv.cpu().numpy(), "uv of the goal"))
     if goal.vertices is None:
-        return SurfaceAim(goal.points, goal.faces, torch.as_tensor(mesh.faces))
+        return SurfaceObjective(goal.points, goal.faces, torch.as_tensor(mesh.faces))
     if goal.faces is not None and not torch.equal(goal.faces, torch.as_tensor(mesh.faces).long()):
         got, expected = f"a mesh of {len(goal.faces)} triangles, which are not the cloth's", "the cloth's mesh, moved"
-        raise InvalidInput("goal", got=got, expected=expected, remedy="ask for its surface, or give x and uv of pieces")
+        raise InvalidInput(
+            "goal", got=got, expected=expected, remedy="use its surface, or give x and uv of material points"
+        )
     count = len(mesh.vertices)
     if int(goal.vertices.min()) < 0 or int(goal.vertices.max()) >= count:
         got = f"{int(goal.vertices.min())} to {int(goal.vertices.max())}"
         raise InvalidInput("vertices of the goal", got=got, expected=f"vertices of the cloth, 0 to {count - 1}")
     corners = goal.vertices[:, None].expand(-1, 3)
     weights = torch.tensor([1.0, 0.0, 0.0]).expand(len(corners), 3)
-    return PiecesAim(goal.points, Hits(corners, weights, torch.zeros(len(corners), dtype=torch.bool)))
+    return MaterialPointObjective(
+        goal.points, ClosestPoints(corners, weights, torch.zeros(len(corners), dtype=torch.bool))
+    )
 
 
-def _offsets(points: Tensor, vertices: Tensor, faces: Tensor) -> tuple[Tensor, Tensor, Hits]:
-    """(from the nearest places of a surface to points [N, 3] m, how each is asked for [N, 3, 3], these places)."""
-    hits = closest(points, vertices, faces)
+def _offsets(points: Tensor, vertices: Tensor, faces: Tensor) -> tuple[Tensor, Tensor, ClosestPoints]:
+    """Offsets [N, 3] m of points from a surface, their stiffness [N, 3, 3], and the closest points."""
+    hits = find_closest_points(points, vertices, faces)
     a, b, c = vertices[hits.corners].unbind(1)
     normal = torch.linalg.cross(b - a, c - a)
     normal = normal / normal.norm(dim=1, keepdim=True).clamp(min=1e-30)
     across, eye = normal[:, :, None] * normal[:, None, :], torch.eye(3).to(points)
-    along = torch.where(hits.beyond, 1.0, ALONG)[:, None, None].to(points)
-    return points - hits.on(vertices), across + along * (eye - across), hits
+    along = torch.where(hits.is_beyond_edge, 1.0, TANGENTIAL_STIFFNESS_RATIO)[:, None, None].to(points)
+    return points - hits.interpolate(vertices), across + along * (eye - across), hits
 
 
-def _pull(offset: Tensor, stiff: Tensor, shifts: Tensor) -> Pull:
-    """Of offsets [M, 3] m that ``shifts`` [N, M, 3] shorten."""
+def _quadratic_model(offset: Tensor, stiffness: Tensor, shifts: Tensor) -> QuadraticModel:
+    """Quadratic model of offsets [M, 3] m, which ``shifts`` [N, M, 3] shorten, weighted by ``stiffness`` [M, 3, 3]."""
     count = len(offset)
     gradient = -2 * torch.einsum("nmi,mi->n", shifts, offset) / count
-    stiffer = torch.einsum("mij,nmj->nmi", stiff, shifts).flatten(1)
-    curvature = 2 * stiffer @ shifts.flatten(1).mT / count
-    return Pull(offset.square().sum(1).mean(), gradient, curvature)
+    stiff_shifts = torch.einsum("mij,nmj->nmi", stiffness, shifts).flatten(1)
+    curvature = 2 * stiff_shifts @ shifts.flatten(1).mT / count
+    return QuadraticModel(offset.square().sum(1).mean(), gradient, curvature)

@@ -1,189 +1,249 @@
-"""Searches for unknowns that bring the cloth to the goal, within what the arms can do."""
+"""Search for waypoints that bring the cloth to the goal within the limits of the arms."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from dataclasses import dataclass
 from functools import partial
 from typing import NamedTuple, Protocol
 
 import torch
 from torch import Tensor
 
-from ..episodes.world_cache import IMPOSSIBLE
-from .constrained_step import step_within
-from .motion_parameters import Bounds
-from .objective import Pull
+from ..episodes.world_cache import IMPOSSIBLE_WORLD_ERRORS
+from .constrained_step import solve_constrained_step
+from .motion_parameters import LinearBounds
+from .objective import QuadraticModel
 
-HALVINGS = 6  # of a step that leads into something
-FIRST, LEAST = 0.1, 1e-4  # of the damping: a path's mean square beside the cloth's
-EASIER, HARDER = 0.2, 4.0  # times the damping, after a step that did what was expected, and after one that did not
-GOOD, POOR = 0.7, 0.2  # of what was expected
-ENOUGH = 0.005  # of the mean square distance, that a further step should gain
-GAIN = f"{100 * ENOUGH:g} % of the mean square distance"
-BLOCKED = "every step that slopes ask for is blocked by a limit or by what is in the arms' way"
-CHAOTIC = "the cloth is so chaotic there that slopes say nothing"
-LAST = 0.05  # of Adam's rate, at the end
-PATIENCE = 20  # of Adam's steps
+MAX_STEP_HALVINGS = 6  # of a step that leads into a collision
+BLOCKED_REASON = "every step along the gradient is blocked by a limit or by an obstacle of the arms"
+CHAOTIC_REASON = "the cloth is so chaotic there that its derivatives are not finite"
 
 
-class Problem(Protocol):
-    """What is sought, and what is in the way."""
-
-    bounds: Bounds
-    metric: Tensor  # [N, N] mean square of the paths' changes, for each unknown squared
-
-    def look(self, at: Tensor) -> tuple[float, float]:
-        """(distance [m], mean square distance [m^2]) at unknowns [N]."""
-        ...
-
-    def pull(self, at: Tensor) -> Pull:
-        """What unknowns do to the mean square distance."""
-        ...
-
-    def slope(self, at: Tensor) -> tuple[float, Tensor]:
-        """(distance [m], its gradient [N])."""
-        ...
-
-    def clear(self, at: Tensor) -> bool:
-        """Whether nothing is in the arms' way."""
-        ...
-
-
-OnLook = Callable[[int, float, float], None]  # (motions looked at, distance [m], that of the best so far)
-
-
-class Found(NamedTuple):
-    """What a search has found.
+@dataclass(frozen=True)
+class GaussNewtonSettings:
+    """Settings of ``gauss_newton``. The damping is relative: mean square path change against mean square distance.
 
     Attributes:
-        best: [N] unknowns.
-        history: m, the distance of every motion that was looked at, in order.
-        ended: why it ended, in words.
+        initial_damping: damping of the first step.
+        min_damping: smallest damping.
+        damping_decrease: factor after a step that gained about what the model predicted.
+        damping_increase: factor after a step that gained far less than the model predicted.
+        good_gain_ratio: gain over predicted gain, above which the damping decreases.
+        poor_gain_ratio: gain over predicted gain, below which the damping increases.
+        min_relative_gain: share of the mean square distance that a further step must promise.
+    """
+
+    initial_damping: float = 0.1
+    min_damping: float = 1e-4
+    damping_decrease: float = 0.2
+    damping_increase: float = 4.0
+    good_gain_ratio: float = 0.7
+    poor_gain_ratio: float = 0.2
+    min_relative_gain: float = 0.005
+
+
+@dataclass(frozen=True)
+class AdamSettings:
+    """Settings of ``adam``.
+
+    Attributes:
+        final_rate_fraction: learning rate at the end, as a fraction of the first one.
+        patience: steps over which the best distance must improve.
+        min_relative_gain: share of the distance by which it must improve in so many steps.
+    """
+
+    final_rate_fraction: float = 0.05
+    patience: int = 20
+    min_relative_gain: float = 0.005
+
+
+class SearchProblem(Protocol):
+    """What a search minimises, and its constraints.
+
+    Attributes:
+        bounds: limits that are linear in the unknowns.
+        metric: [N, N], mean square change of the grippers' paths per squared unknown.
+    """
+
+    bounds: LinearBounds
+    metric: Tensor
+
+    def evaluate(self, at: Tensor) -> tuple[float, float]:
+        """Return the distance [m] and the mean square distance [m^2] at the unknowns [N]."""
+        ...
+
+    def quadratic_model(self, at: Tensor) -> QuadraticModel:
+        """Return the local model of the mean square distance at the unknowns [N]."""
+        ...
+
+    def distance_gradient(self, at: Tensor) -> tuple[float, Tensor]:
+        """Return the distance [m] and its gradient [N]."""
+        ...
+
+    def is_clear(self, at: Tensor) -> bool:
+        """Return whether the arms collide with nothing."""
+        ...
+
+
+ProgressCallback = Callable[[int, float, float], None]  # (number of motions evaluated, distance [m], best distance [m])
+
+
+class SearchResult(NamedTuple):
+    """The result of a search.
+
+    Attributes:
+        best: [N], the best unknowns.
+        history: m, the distance of every motion that was evaluated, in order.
+        stop_reason: why the search stopped, in words.
     """
 
     best: Tensor
     history: list[float]
-    ended: str
+    stop_reason: str
 
 
-def gauss_newton(problem: Problem, start: Tensor, iterations: int, on_look: OnLook) -> Found:
-    """Levenberg's and Marquardt's method on the mean square distance, damped by how far the grippers' paths change.
+def gauss_newton(
+    problem: SearchProblem,
+    start: Tensor,
+    iterations: int,
+    on_progress: ProgressCallback,
+    settings: GaussNewtonSettings = GaussNewtonSettings(),
+) -> SearchResult:
+    """Minimise the mean square distance by the Levenberg-Marquardt method.
+
+    The damping penalises how far the grippers' paths change.
 
     Args:
-        problem: what is sought.
+        problem: what is minimised, and its constraints.
         start: [N], within the bounds and clear.
-        iterations: at most so many steps, taken or not.
-        on_look: called after every motion that was looked at.
+        iterations: largest number of steps, accepted or not.
+        on_progress: called after every motion that was evaluated.
+        settings: damping and stopping rule.
     """
     history: list[float] = []
     squares: list[float] = []
 
-    def look(at: Tensor) -> float:
+    def evaluate(at: Tensor) -> float:
         try:
-            distance, square = problem.look(at)
-        except IMPOSSIBLE:
+            distance, square = problem.evaluate(at)
+        except IMPOSSIBLE_WORLD_ERRORS:
             if not history:
                 raise
             distance = square = math.inf
         history.append(distance)
         squares.append(square)
-        on_look(len(history), distance, history[squares.index(min(squares))])  # the one that is kept
+        on_progress(len(history), distance, history[squares.index(min(squares))])  # of the motion that would be kept
         return square
 
-    at, damping = start, FIRST
-    value, pull = look(at), None
+    min_gain, min_damping = settings.min_relative_gain, settings.min_damping
+    at, damping = start, settings.initial_damping
+    value, model = evaluate(at), None
     for _ in range(iterations):
-        fresh = pull is None
-        if pull is None:
-            pull = problem.pull(at)
-            if not all(bool(part.isfinite().all()) for part in pull):
-                return Found(at, history, CHAOTIC)
-        step, expected = _promised(problem, at, pull, damping)
-        while fresh and expected <= ENOUGH * value and damping > LEAST and bool(step.any()):
-            damping = max(EASIER * damping, LEAST)
-            step, expected = _promised(problem, at, pull, damping)
-        if expected <= ENOUGH * value:
-            if bool(pull.gradient.any()) and not bool(step.any()):
-                return Found(at, history, BLOCKED)
-            return Found(at, history, f"{'no further' if fresh else 'no smaller'} step would gain more than {GAIN}")
-        there = look(at + step)
-        gained = (value - there) / expected
-        damping = max(damping * (EASIER if gained > GOOD else HARDER if gained < POOR else 1.0), LEAST)
-        if there < value:
-            at, value, pull = at + step, there, None
-    return Found(at, history, f"after {iterations} iterations")
+        new_point = model is None
+        if model is None:
+            model = problem.quadratic_model(at)
+            if not all(bool(part.isfinite().all()) for part in model):
+                return SearchResult(at, history, CHAOTIC_REASON)
+        step, predicted = _clear_step(problem, at, model, damping)
+        while new_point and predicted <= min_gain * value and damping > min_damping and bool(step.any()):
+            damping = max(settings.damping_decrease * damping, min_damping)
+            step, predicted = _clear_step(problem, at, model, damping)
+        if predicted <= min_gain * value:
+            if bool(model.gradient.any()) and not bool(step.any()):
+                return SearchResult(at, history, BLOCKED_REASON)
+            what, gain = "no further" if new_point else "no smaller", f"{100 * min_gain:g} %"
+            return SearchResult(at, history, f"{what} step would gain more than {gain} of the mean square distance")
+        new_value = evaluate(at + step)
+        ratio = (value - new_value) / predicted
+        factor = 1.0
+        if ratio > settings.good_gain_ratio:
+            factor = settings.damping_decrease
+        elif ratio < settings.poor_gain_ratio:
+            factor = settings.damping_increase
+        damping = max(damping * factor, min_damping)
+        if new_value < value:
+            at, value, model = at + step, new_value, None
+    return SearchResult(at, history, f"after {iterations} iterations")
 
 
-def _promised(problem: Problem, at: Tensor, pull: Pull, damping: float) -> tuple[Tensor, float]:
-    """(step [N], by how much the mean square distance should fall [m^2])."""
-    step = _clear(problem, at, partial(_damped, problem, at, pull, damping))
-    return step, -float(pull.gradient @ step + 0.5 * step @ pull.curvature @ step)
+def _clear_step(problem: SearchProblem, at: Tensor, model: QuadraticModel, damping: float) -> tuple[Tensor, float]:
+    """A collision-free step [N] within the bounds, and the predicted decrease of the mean square distance [m^2]."""
+    curvature = model.curvature + damping * problem.metric
+    full = solve_constrained_step(at, model.gradient, curvature, problem.bounds)
+    step = _shorten_until_clear(problem, at, lambda fraction: fraction * full)
+    return step, -float(model.gradient @ step + 0.5 * step @ model.curvature @ step)
 
 
-def _damped(problem: Problem, at: Tensor, pull: Pull, damping: float, share: float) -> Tensor:
-    """A share of the step within the bounds, for so much damping."""
-    return share * step_within(at, pull.gradient, pull.curvature + damping * problem.metric, problem.bounds)
+def adam(
+    problem: SearchProblem,
+    start: Tensor,
+    iterations: int,
+    rate: float,
+    on_progress: ProgressCallback,
+    settings: AdamSettings = AdamSettings(),
+) -> SearchResult:
+    """Minimise the distance by Adam (Kingma and Ba 2015), with gradients by reverse mode.
 
-
-def adam(problem: Problem, start: Tensor, iterations: int, rate: float, on_look: OnLook) -> Found:
-    """Adam (Kingma and Ba 2015) on the distance, by reverse mode, with a rate that falls as a cosine.
-
-    After every step, the nearest point within the bounds.
+    The learning rate falls as a cosine. Every step is projected to the nearest point within the bounds.
 
     Args:
-        problem: what is sought.
+        problem: what is minimised, and its constraints.
         start: [N], within the bounds and clear.
-        iterations: at most so many steps.
-        rate: of the first ones, of each unknown.
-        on_look: called after every motion that was looked at.
+        iterations: largest number of steps.
+        rate: learning rate of the first steps, for each unknown.
+        on_progress: called after every motion that was evaluated.
+        settings: schedule and stopping rule.
     """
+    patience, last = settings.patience, settings.final_rate_fraction
     at = start.clone().requires_grad_()
     optimiser = torch.optim.Adam([at], lr=rate)
-    falling = torch.optim.lr_scheduler.LambdaLR(optimiser, lambda k: _share(k, iterations))
-    eye = torch.eye(len(start)).to(start)
-    best, bests, history = start, [], []
+    schedule = torch.optim.lr_scheduler.LambdaLR(
+        optimiser, lambda k: last + (1 - last) * 0.5 * (1 + math.cos(math.pi * k / max(iterations, 1)))
+    )
+    identity = torch.eye(len(start)).to(start)
+    best, best_history, history = start, [], []
     for k in range(iterations + 1):
-        before = at.detach().clone()
+        here = at.detach().clone()
         try:
-            value, gradient = problem.slope(before)
-        except IMPOSSIBLE:
+            value, gradient = problem.distance_gradient(here)
+        except IMPOSSIBLE_WORLD_ERRORS:
             if not history:
                 raise
             value, gradient = math.inf, None
         if value < min(history, default=math.inf):
-            best = before
+            best = here
         history.append(value)
-        bests.append(min(history))
-        on_look(len(history), value, bests[-1])
+        best_history.append(min(history))
+        on_progress(len(history), value, best_history[-1])
         if gradient is not None and not bool(gradient.isfinite().all()):
-            return Found(best, history, CHAOTIC)
+            return SearchResult(best, history, CHAOTIC_REASON)
         if k == iterations:
             break
-        if len(bests) > PATIENCE and bests[-1 - PATIENCE] - bests[-1] < ENOUGH * bests[-1]:
-            return Found(best, history, f"the last {PATIENCE} steps gained less than {100 * ENOUGH:g} %")
+        if len(best_history) > patience:
+            gain = best_history[-1 - patience] - best_history[-1]
+            if gain < settings.min_relative_gain * best_history[-1]:
+                reason = f"the last {patience} steps gained less than {100 * settings.min_relative_gain:g} %"
+                return SearchResult(best, history, reason)
         if gradient is None:
-            step = _clear(problem, before, lambda share, b=before, t=best: (1 - 0.5 * share) * (t - b))
+            step = _shorten_until_clear(problem, here, lambda f, a=here, b=best: (1 - 0.5 * f) * (b - a))
         else:
             at.grad = gradient
             optimiser.step()
-            wanted = at.detach() - before
-            nearest = lambda share, b=before, w=wanted: step_within(b, -share * w, eye, problem.bounds)  # noqa: E731
-            step = _clear(problem, before, nearest)
-        falling.step()
+            wanted = at.detach() - here
+            project = partial(solve_constrained_step, here, curvature=identity, bounds=problem.bounds)
+            step = _shorten_until_clear(problem, here, lambda f, w=wanted, p=project: p(gradient=-f * w))
+        schedule.step()
         with torch.no_grad():
-            at.copy_(before + step)
-    return Found(best, history, f"after {iterations} iterations")
+            at.copy_(here + step)
+    return SearchResult(best, history, f"after {iterations} iterations")
 
 
-def _clear(problem: Problem, at: Tensor, step: Callable[[float], Tensor]) -> Tensor:
-    """The step, or as large a share of it as leads into nothing."""
-    for k in range(HALVINGS):
-        found = step(0.5**k)
-        if problem.clear(at + found):
-            return found
+def _shorten_until_clear(problem: SearchProblem, at: Tensor, step: Callable[[float], Tensor]) -> Tensor:
+    """The largest of the halved steps that leads into no collision; zero if all do."""
+    for k in range(MAX_STEP_HALVINGS):
+        shortened = step(0.5**k)
+        if problem.is_clear(at + shortened):
+            return shortened
     return torch.zeros_like(at)
-
-
-def _share(k: int, iterations: int) -> float:
-    return LAST + (1 - LAST) * 0.5 * (1 + math.cos(math.pi * k / max(iterations, 1)))

@@ -1,4 +1,4 @@
-"""A motion after which the cloth lies at the goal, by gradients through cloth and arms."""
+"""Motion planning by gradients through cloth and arms."""
 
 from __future__ import annotations
 
@@ -11,20 +11,22 @@ from torch import Tensor
 
 from ..errors import InvalidInput
 from ..recordings import Recording
-from ..robots import ACCELERATION  # pyright: ignore[reportMissingImports] - mapped from robots/ at installation
-from ..robots.primitives import Limits  # pyright: ignore[reportMissingImports]
+from ..robots import (  # pyright: ignore[reportMissingImports] - mapped from robots/ at installation
+    DEFAULT_JOINT_ACCELERATION,
+)
+from ..robots.primitives import GripperLimits  # pyright: ignore[reportMissingImports]
 from ..types import Trajectory
-from .episode_conversion import as_episode
+from .episode_conversion import build_planned_episode
 from .goal import Goal
-from .optimizers import OnLook, adam, gauss_newton
-from .problem import Asked, Believed, check_positive, posed
+from .optimizers import ProgressCallback, adam, gauss_newton
+from .problem import ClothModel, PlanOptions, build_problem, check_positive
 from .result import MotionPlan
 
-METHODS = ("gauss-newton", "adam")
+SEARCH_METHODS = ("gauss-newton", "adam")
 
 
 def plan(
-    model: Believed | Sequence[Believed],
+    model: ClothModel | Sequence[ClothModel],
     recording: Recording,
     goal: Goal | Tensor,
     *,
@@ -33,79 +35,87 @@ def plan(
     method: Literal["gauss-newton", "adam"] = "gauss-newton",
     rate: float = 0.003,
     wait: float = 0.3,
-    acceleration: float = ACCELERATION,
-    limits: Limits = Limits(),  # noqa: B008 - a tuple
+    acceleration: float = DEFAULT_JOINT_ACCELERATION,
+    limits: GripperLimits = GripperLimits(),  # noqa: B008 - a tuple
     clearance: float = 0.02,
     dt: float | None = None,
-    on_progress: OnLook = lambda number, distance, best: None,
+    on_progress: ProgressCallback = lambda number, distance, best: None,
     journal: str | Path | None = None,
     resume: bool | None = None,
 ) -> MotionPlan:
-    """Changes the motion of an episode's grippers until the simulated cloth ends at the goal.
+    """Change the motion of an episode's grippers until the simulated cloth ends at the goal.
 
-    To the joint angles of each arm, or to the pose of a gripper without one, a smooth curve through ``waypoints`` is
-    added, from the first frame on; when the grippers open and close stays. The distance from the goal at the end is
-    descended by its gradient through cloth and kinematics. Every motion that is tried keeps the joints' limits of
-    position, velocity and acceleration, and arms clear of each other, of the table and of themselves, or of what the
-    recorded motion does where that is beyond them.
+    A smooth curve through ``waypoints`` is added to the joint angles of each arm, or to the pose of a gripper without
+    an arm. It starts at the first frame. The times at which grippers open and close do not change. The search descends
+    the distance to the goal at the end by its gradient through cloth and kinematics.
+
+    Every motion that is evaluated keeps the joints' limits of position, velocity and acceleration. Arms stay clear of
+    each other, of the table and of themselves. Where the recorded motion exceeds a limit, its own value is the limit.
 
     Args:
-        model: the cloth, or a model of a diagnosis (``diagnosis.load_model``), whose robot and observer may err;
-            several, e.g. drawn from what a fit leaves open: the mean distance is descended.
-        recording: where the cloth is, who holds it, which arms these are, and the motion to begin with.
-        goal: where the cloth shall be after the motion and the wait, as the observer of the recording would see it.
-        waypoints: of each gripper.
-        iterations: at most so many steps.
-        method: "gauss-newton": on the mean square distance, by tangents. "adam": on the distance, by reverse mode, as
-            the DiffCP paper descends.
-        rate: of Adam's first steps: of each waypoint of each joint [rad], or of a free gripper [m, rad].
-        wait: s after the motion, until the cloth is compared with the goal.
-        acceleration: rad/s^2, of any joint; robots name no limit of it.
+        model: the cloth, or a model of a diagnosis (``diagnosis.load_model``), which may include errors of robot and
+            observer. Of several models, e.g. samples of a posterior, the mean distance is minimised.
+        recording: gives the first shape, the grasps, the arms and the motion to begin with.
+        goal: where the cloth shall be after the motion and the wait, as the recording's observer would see it.
+        waypoints: number of waypoints of each gripper.
+        iterations: largest number of steps.
+        method: "gauss-newton" minimises the mean square distance by tangents. "adam" minimises the distance by reverse
+            mode, as the DiffCP paper does.
+        rate: learning rate of Adam's first steps, for each waypoint of a joint [rad] or of a free gripper [m, rad].
+        wait: s, time after the motion until the cloth is compared with the goal.
+        acceleration: rad/s^2, largest acceleration of any joint; robot descriptions give none.
         limits: of a gripper without an arm, along each axis.
-        clearance: m, between arms, and between an arm and the table.
+        clearance: m, smallest distance between arms, and between an arm and the table.
         dt: s, largest substep; None: the stable one.
-        on_progress: called with (number of motions looked at, its distance [m], the best so far [m]).
-        journal: folder that keeps what was computed, so that a search that was stopped can go on.
-        resume: take up what the journal holds; None: there must be nothing.
+        on_progress: called with (number of motions evaluated, distance of this one [m], best distance [m]).
+        journal: folder that keeps computed results, so that a stopped search can resume.
+        resume: continue from the journal; None: the journal must be empty.
+
+    Returns:
+        The planned motion and what is expected of it.
 
     Raises:
-        InvalidInput: arguments that give no search, a goal that is not of this cloth, or as ``Journal``.
-        RecordingError: no motion for one of the cloth's grasps.
-        SimulationDiverged: already under the recorded motion.
+        InvalidInput: invalid arguments, a goal that does not fit this cloth, or as ``ResumableStore``.
+        RecordingError: the episode has no motion for one of the cloth's grasps.
+        SimulationDiverged: the simulation of the recorded motion diverges.
     """
-    began = time.monotonic()
-    if method not in METHODS:
-        raise InvalidInput("method", got=repr(method), expected=f"one of {', '.join(METHODS)}")
+    started = time.monotonic()
+    if method not in SEARCH_METHODS:
+        raise InvalidInput("method", got=repr(method), expected=f"one of {', '.join(SEARCH_METHODS)}")
     check_positive(iterations=iterations, rate=rate)
     iterations = int(iterations)
-    asked = Asked(waypoints, wait, acceleration, limits, clearance, dt)
-    task, warnings = posed(model, recording, goal, asked, journal, resume)
+    options = PlanOptions(waypoints, wait, acceleration, limits, clearance, dt)
+    task, warnings = build_problem(model, recording, goal, options, journal, resume)
     if method == "adam":
-        found = adam(task, task.start, iterations, rate, on_progress)
+        result = adam(task, task.start, iterations, rate, on_progress)
     else:
-        found = gauss_newton(task, task.start, iterations, on_progress)
-    (before, frames_before), (after, frames) = task.each(task.start), task.each(found.best)
-    first, last = task.motion(task.start), task.motion(found.best)
-    gap = task.nearest(found.best)
+        result = gauss_newton(task, task.start, iterations, on_progress)
+    (distance_before, frames_before), (distance_after, frames) = (
+        task.evaluate_models(at) for at in (task.start, result.best)
+    )
+    recorded, planned = task.motion(task.start), task.motion(result.best)
+    gap = task.smallest_gap(result.best)
     return MotionPlan(
-        recording=as_episode(recording, task.courses, task.split(found.best)),
-        motion=last,
-        before=before,
-        after=after,
-        history=found.history,
-        times=task.rehearsals[0].times,
+        recording=build_planned_episode(recording, task.motions, task.split_waypoints(result.best)),
+        motion=planned,
+        distance_before=distance_before,
+        distance_after=distance_after,
+        distance_history=result.history,
+        times=task.forward_models[0].times,
         frames=frames,
         frames_before=frames_before,
-        faces=task.rehearsals[0].faces,
-        moved={name: _apart(first[name], last[name]) for name in last},
-        limit=task.bounds.nearest(found.best),
-        nearest="" if gap is None or not gap.first else f"{gap.first} to {gap.second}, {1e3 * gap.distance:.0f} mm",
-        ended=found.ended,
-        seconds=time.monotonic() - began,
+        faces=task.forward_models[0].faces,
+        path_change={name: _max_displacement(recorded[name], planned[name]) for name in planned},
+        nearest_limit=task.bounds.nearest_limit(result.best),
+        nearest_solids=(
+            "" if gap is None or not gap.first else f"{gap.first} to {gap.second}, {1e3 * gap.distance:.0f} mm"
+        ),
+        stop_reason=result.stop_reason,
+        seconds=time.monotonic() - started,
         warnings=warnings,
     )
 
 
-def _apart(first: Trajectory, last: Trajectory) -> float:
-    """m, the greatest distance of two paths at one time."""
-    return float((last.pose[:, :3, 3] - first.pose[:, :3, 3]).norm(dim=-1).max())
+def _max_displacement(first: Trajectory, second: Trajectory) -> float:
+    """Largest distance [m] of two paths at the same time."""
+    return float((second.pose[:, :3, 3] - first.pose[:, :3, 3]).norm(dim=-1).max())

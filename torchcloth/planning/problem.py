@@ -1,138 +1,173 @@
-"""What is sought, from a model, an episode and a goal, with what is doubtful about it."""
+"""The planning task of a model, an episode and a goal, with warnings about them."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 from torch import Tensor
 
-from .._utils.resume import Journal
+from .._utils.resume import ResumableStore
 from ..cloth import Cloth
-from ..episodes.cloth_facts import facts_of
-from ..episodes.observed import on_cpu
-from ..episodes.world import Model
+from ..episodes.cloth_fingerprint import cloth_fingerprint_parts
+from ..episodes.observed import require_cpu
+from ..episodes.world import WorldModel
 from ..errors import InvalidInput
 from ..recordings import Recording
 from ..recordings.consistency import check_recording
-from ..robots.primitives import Limits  # pyright: ignore[reportMissingImports] - mapped from robots/ at installation
-from .clearance import clearance_of
-from .episode_conversion import courses_of, doubts
-from .forward_model import Rehearsal, plain
+from ..robots.primitives import GripperLimits  # pyright: ignore[reportMissingImports] - mapped from robots/
+from .clearance import build_clearance
+from .episode_conversion import extract_motion_parameters, motion_warnings
+from .forward_model import ForwardModel, exact_model
 from .goal import Goal
-from .motion_parameters import Course
-from .objective import aim_at
-from .task import Task
+from .motion_parameters import GripperMotionParameters
+from .objective import build_objective
+from .task import PlanningTask
 
-SAME = 1e-6  # m
-LONGEST = 60.0  # s, of a wait
-LARGE = 3.0  # times the cloth's extent: no goal of it in metres
-Believed = Cloth | Model
+MAX_UV_OFFSET_M = 1e-6  # two meshes whose pattern coordinates differ by less are one
+MAX_WAIT_S = 60.0
+MAX_GOAL_EXTENT_RATIO = 3.0  # of a goal's extent to the cloth's: a larger goal is not in metres
+ClothModel = Cloth | WorldModel
 
 
-class Asked(NamedTuple):
-    """Of ``plan``, see there."""
+@dataclass(frozen=True)
+class PlanOptions:
+    """Options of a motion plan; see ``plan``.
+
+    Attributes:
+        waypoints: number of waypoints of each gripper.
+        wait: s, time after the motion until the cloth is compared with the goal.
+        acceleration: rad/s^2, largest acceleration of any joint.
+        limits: of a gripper without an arm, along each axis.
+        clearance: m, smallest distance between arms, and between an arm and the table.
+        dt: s, largest substep; None: the stable one.
+    """
 
     waypoints: int
     wait: float
     acceleration: float
-    limits: Limits
+    limits: GripperLimits
     clearance: float
     dt: float | None
 
 
-def posed(
-    model: Believed | Sequence[Believed],
+def build_problem(
+    model: ClothModel | Sequence[ClothModel],
     recording: Recording,
     goal: Goal | Tensor,
-    asked: Asked,
+    options: PlanOptions,
     journal: str | Path | None = None,
     resume: bool | None = None,
-    course: Callable[[Course], Course] = lambda course: course,
-) -> tuple[Task, list[str]]:
-    """(what is sought, warnings); ``course`` changes what is added to a gripper's motion.
+    adapt_motion: Callable[[GripperMotionParameters], GripperMotionParameters] = lambda motion: motion,
+) -> tuple[PlanningTask, list[str]]:
+    """Build the planning task.
+
+    Args:
+        model: the cloth model or models.
+        recording: the episode to begin with.
+        goal: where the cloth shall be.
+        options: of the plan.
+        journal: folder that keeps computed results.
+        resume: continue from the journal; None: the journal must be empty.
+        adapt_motion: changes the parametrisation of a gripper's motion.
+
+    Returns:
+        The task, and warnings in sentences.
 
     Raises:
         InvalidInput, RecordingError: as ``plan``.
     """
     check_recording(recording)
-    _check(asked)
-    models = _models(model)
-    wanted = goal if isinstance(goal, Goal) else Goal(goal)
-    for m in models:
-        aim_at(wanted, m.base.cloth.mesh)  # refuses what is not of this cloth before anything is simulated
+    _check_options(options)
+    models = _as_models(model)
+    target = goal if isinstance(goal, Goal) else Goal(goal)
+    for each in models:
+        build_objective(target, each.base.cloth.mesh)  # refuses a goal of another cloth before anything is simulated
     cloth = models[0].base.cloth
-    courses = courses_of(cloth, recording, int(asked.waypoints), asked.wait, asked.acceleration, asked.limits)
-    courses = [course(c) for c in courses]
-    rehearsals = [Rehearsal(m, recording, courses, asked.dt) for m in models]
+    motions = extract_motion_parameters(
+        cloth, recording, int(options.waypoints), options.wait, options.acceleration, options.limits
+    )
+    motions = [adapt_motion(motion) for motion in motions]
+    forward_models = [ForwardModel(each, recording, motions, options.dt) for each in models]
     warnings = [
-        *doubts(recording, courses),
-        *_check_goal(wanted, rehearsals[0]),
-        *_renumbered(wanted, recording, cloth),
+        *motion_warnings(recording, motions),
+        *_check_goal(target, forward_models[0]),
+        *_numbering_warnings(target, recording, cloth),
     ]
-    judge, doubt = clearance_of(recording, courses, wanted.points, asked.clearance)
-    kept = None if journal is None else Journal(journal, _problem(rehearsals, wanted, courses), resume)
-    return Task(rehearsals, courses, wanted, judge, kept), [*warnings, *([doubt] if doubt else [])]
+    clearance, warning = build_clearance(recording, motions, target.points, options.clearance)
+    store = None if journal is None else ResumableStore(journal, _identity(forward_models, target, motions), resume)
+    return PlanningTask(forward_models, motions, target, clearance, store), [*warnings, *([warning] if warning else [])]
 
 
-def _check(asked: Asked) -> None:
-    if not 0 <= asked.wait <= LONGEST:
-        raise InvalidInput("wait", got=asked.wait, expected=f"seconds, 0 to {LONGEST:g}")
-    check_positive(waypoints=asked.waypoints, acceleration=asked.acceleration, clearance=asked.clearance)
-    check_positive(speed=asked.limits.speed, hardest=asked.limits.acceleration)
+def _check_options(options: PlanOptions) -> None:
+    if not 0 <= options.wait <= MAX_WAIT_S:
+        raise InvalidInput("wait", got=options.wait, expected=f"seconds, 0 to {MAX_WAIT_S:g}")
+    check_positive(waypoints=options.waypoints, acceleration=options.acceleration, clearance=options.clearance)
+    check_positive(speed=options.limits.speed, gripper_acceleration=options.limits.acceleration)
 
 
-def _models(model: Believed | Sequence[Believed]) -> list[Model]:
+def _as_models(model: ClothModel | Sequence[ClothModel]) -> list[WorldModel]:
     given = list(model) if isinstance(model, Sequence) else [model]
-    if not given or not all(isinstance(m, Cloth | Model) for m in given):
+    if not given or not all(isinstance(m, Cloth | WorldModel) for m in given):
         got = "none" if not given else ", ".join(sorted({type(m).__name__ for m in given}))
-        raise InvalidInput("model", got=got, expected="a Cloth or a diagnosis.Model, or several")
-    found = [m if isinstance(m, Model) else plain(m) for m in given]
-    for m in found:
-        on_cpu(m.base.cloth)
-    return found
+        raise InvalidInput("model", got=got, expected="a Cloth or a diagnosis.WorldModel, or several")
+    models = [m if isinstance(m, WorldModel) else exact_model(m) for m in given]
+    for m in models:
+        require_cpu(m.base.cloth)
+    return models
 
 
-def _problem(rehearsals: Sequence[Rehearsal], goal: Goal, courses: Sequence[Course]) -> list[object]:
-    """What slopes depend on beside the point."""
-    own = [part for r in rehearsals for part in (*facts_of(r.world.cloth), *r.identity())]
-    ways = [part for c in courses for part in (c.name, c.span, c.start, c.trajectory(c.nothing).pose)]
-    return [*own, goal.points, goal.faces, goal.uv, goal.vertices, *ways]
+def _identity(
+    forward_models: Sequence[ForwardModel], goal: Goal, motions: Sequence[GripperMotionParameters]
+) -> list[object]:
+    """Everything but the waypoints that derivatives depend on."""
+    of_models = [
+        part for model in forward_models for part in (*cloth_fingerprint_parts(model.world.cloth), *model.identity())
+    ]
+    of_motions = [
+        part for m in motions for part in (m.name, m.span, m.recorded_coordinates, m.trajectory(m.zero_waypoints).pose)
+    ]
+    return [*of_models, goal.points, goal.faces, goal.uv, goal.vertices, *of_motions]
 
 
 def check_positive(**numbers: float) -> None:
-    """Numbers of which some count."""
+    """Refuse numbers that are not finite and positive; counts must be whole as well.
+
+    Raises:
+        InvalidInput: names the first wrong one.
+    """
     for name, value in numbers.items():
         whole = name in ("waypoints", "iterations")
         if not math.isfinite(value) or value <= 0 or (whole and value != int(value)):
             raise InvalidInput(name, got=value, expected="a whole number > 0" if whole else "a finite value > 0")
 
 
-def _renumbered(goal: Goal, recording: Recording, cloth: Cloth) -> list[str]:
-    """A doubt about pieces by vertex, of a mesh on which grips end elsewhere than on that of the episode."""
-    own, moved = recording.cloth.uv, cloth.mesh.uv
-    if goal.vertices is None or own is None or moved is None or own.shape != moved.shape:
+def _numbering_warnings(goal: Goal, recording: Recording, cloth: Cloth) -> list[str]:
+    """Goals by vertex count on the cloth's own mesh, which may differ from the episode's where grips end."""
+    uv, cloth_uv = recording.cloth.uv, cloth.mesh.uv
+    if goal.vertices is None or uv is None or cloth_uv is None or uv.shape != cloth_uv.shape:
         return []
-    apart = float(np.linalg.norm(moved - own, axis=-1).max())
-    if apart < SAME:
+    offset = float(np.linalg.norm(cloth_uv - uv, axis=-1).max())
+    if offset < MAX_UV_OFFSET_M:
         return []
     return [
-        f"pieces by vertex are those of the cloth's own mesh, up to {1e3 * apart:.1f} mm from the episode's where "
-        "grips end: of the episode's mesh give its vt, or uv"
+        f"the goal's vertices are those of the cloth's own mesh, up to {1e3 * offset:.1f} mm from the episode's where "
+        "grips end: for the episode's mesh, give vt or uv"
     ]
 
 
-def _check_goal(goal: Goal, run: Rehearsal) -> list[str]:
-    """In millimetres it would be a thousand times as large; a doubt about one that is far away."""
-    x = run.state.x
-    size, own = float((goal.points.amax(0) - goal.points.amin(0)).norm()), run.world.cloth.mesh.extent
-    if size > LARGE * own:
-        got = f"points over {size:.3g} m, of a cloth of {own:.3g} m"
+def _check_goal(goal: Goal, forward_model: ForwardModel) -> list[str]:
+    """Refuse a goal in millimetres; warn about one that is far away."""
+    x = forward_model.state.x
+    size = float((goal.points.amax(0) - goal.points.amin(0)).norm())
+    extent = forward_model.world.cloth.mesh.extent
+    if size > MAX_GOAL_EXTENT_RATIO * extent:
+        got = f"points over {size:.3g} m, of a cloth of {extent:.3g} m"
         raise InvalidInput("goal", got=got, expected="the cloth where it shall be, in metres")
-    away = float((goal.points.mean(0).to(x) - x.mean(0)).norm())
-    if away < LARGE * own:
+    distance = float((goal.points.mean(0).to(x) - x.mean(0)).norm())
+    if distance < MAX_GOAL_EXTENT_RATIO * extent:
         return []
-    return [f"the goal is {away:.2f} m from where the cloth is at first: are both in one world?"]
+    return [f"the goal is {distance:.2f} m from where the cloth is at first: are both in one world frame?"]

@@ -1,4 +1,4 @@
-"""What is sought: waypoints of all grippers after which the cloth, as the models have it, lies at the goal."""
+"""The planning task: find waypoints of all grippers after which the simulated cloth lies at the goal."""
 
 from __future__ import annotations
 
@@ -9,129 +9,138 @@ import torch
 from torch import Tensor
 from torch.func import jacfwd
 
-from .._utils.resume import Journal
+from .._utils.resume import ResumableStore
 from ..robots.clearance import Gap  # pyright: ignore[reportMissingImports] - mapped from robots/ at installation
 from ..types import Trajectory
-from .clearance import Clearance
-from .forward_model import Rehearsal
+from .clearance import ArmClearance
+from .forward_model import ForwardModel
 from .goal import Goal
-from .motion_parameters import Bounds, Course
-from .objective import Pull, aim_at, mean
+from .motion_parameters import GripperMotionParameters, LinearBounds
+from .objective import QuadraticModel, average_models, build_objective
 
-LEVER = 0.1  # m, at which a gripper's turns count as shifts
+ROTATION_LEVER_ARM_M = 0.1  # turns the rotation of a gripper into an equivalent displacement
+METRIC_REGULARISATION_M2 = 1e-3  # for unknowns that move no gripper
 T = TypeVar("T", bound=Sequence)
-STIFF = 1e-3  # m^2, of unknowns that move no gripper
 
 
-class Task:
-    """See ``descent.Problem``; all distances are means over the models.
+class PlanningTask:
+    """The distance between cloth and goal as a function of all waypoints; see ``optimizers.SearchProblem``.
+
+    All distances are means over the models. The unknowns [N] are the waypoints [K, C] of the grippers, flattened, one
+    gripper after the other.
 
     Args:
-        rehearsals: of each model.
-        courses: of the grippers; the unknowns are their waypoints [K, C], flat, one course after the other.
+        forward_models: one for each cloth model.
+        motions: parametrised motions of the grippers.
         goal: where the cloth shall be.
-        clearance: what the arms must stay clear of; None: nothing is known.
-        journal: keeps what was computed.
+        clearance: check of the arms; None if there is none.
+        store: keeps computed results, so that a stopped search can resume.
     """
 
     def __init__(
         self,
-        rehearsals: Sequence[Rehearsal],
-        courses: Sequence[Course],
+        forward_models: Sequence[ForwardModel],
+        motions: Sequence[GripperMotionParameters],
         goal: Goal,
-        clearance: Clearance | None,
-        journal: Journal | None,
+        clearance: ArmClearance | None,
+        store: ResumableStore | None,
     ) -> None:
-        self.rehearsals, self.courses, self.goal = rehearsals, courses, goal
-        self.bounds, self._clearance, self._journal = Bounds.of(courses), clearance, journal
-        self.aims = [aim_at(goal, r.mesh) for r in rehearsals]
-        self.start = torch.cat([c.nothing.flatten() for c in courses])
-        self.metric = self._metric()
+        self.forward_models, self.motions, self.goal = forward_models, motions, goal
+        self.bounds, self._clearance, self._store = LinearBounds.concatenate(motions), clearance, store
+        self.objectives = [build_objective(goal, model.mesh) for model in forward_models]
+        self.start = torch.cat([motion.zero_waypoints.flatten() for motion in motions])
+        self.metric = self._path_metric()
 
     def motion(self, at: Tensor) -> dict[str, Trajectory]:
-        """The poses by gripper, at unknowns [N]; differentiable."""
-        return {c.name: c.trajectory(z) for c, z in zip(self.courses, self.split(at), strict=True)}
+        """Return the poses by gripper at the unknowns [N]; differentiable."""
+        return {m.name: m.trajectory(z) for m, z in zip(self.motions, self.split_waypoints(at), strict=True)}
 
-    def split(self, at: Tensor) -> list[Tensor]:
-        """Waypoints [K, C] of each course."""
-        shapes = [c.nothing.shape for c in self.courses]
-        return [p.reshape(s) for p, s in zip(at.split([s.numel() for s in shapes]), shapes, strict=True)]
+    def split_waypoints(self, at: Tensor) -> list[Tensor]:
+        """Split the unknowns [N] into the waypoints [K, C] of each gripper."""
+        shapes = [motion.zero_waypoints.shape for motion in self.motions]
+        return [part.reshape(s) for part, s in zip(at.split([s.numel() for s in shapes]), shapes, strict=True)]
 
     @torch.no_grad()
-    def look(self, at: Tensor) -> tuple[float, float]:
-        """(distance [m], mean square distance [m^2])."""
-        distance, square = self._ask("look", at, lambda: self._look(at))
-        return float(distance), float(square)
+    def evaluate(self, at: Tensor) -> tuple[float, float]:
+        """Return the distance [m] and the mean square distance [m^2] at the unknowns [N]."""
+        distance, mean_square = self._compute("evaluate", at, lambda: self._evaluate(at))
+        return float(distance), float(mean_square)
 
-    def pull(self, at: Tensor) -> Pull:
-        """What the unknowns do to the mean square distance: by forward mode, in constant memory; float64."""
-        return Pull(*(part.double() for part in self._ask("pull", at, lambda: self._pull(at))))
+    def quadratic_model(self, at: Tensor) -> QuadraticModel:
+        """Return the local model of the mean square distance, by forward mode in constant memory (float64)."""
+        return QuadraticModel(
+            *(part.double() for part in self._compute("quadratic_model", at, lambda: self._quadratic_model(at)))
+        )
 
-    def slope(self, at: Tensor) -> tuple[float, Tensor]:
-        """(distance [m], its gradient [N]), by reverse mode."""
-        distance, gradient = self._ask("slope", at, lambda: self._slope(at))
+    def distance_gradient(self, at: Tensor) -> tuple[float, Tensor]:
+        """Return the distance [m] and its gradient [N], by reverse mode."""
+        distance, gradient = self._compute("distance_gradient", at, lambda: self._distance_gradient(at))
         return float(distance), gradient
 
-    def clear(self, at: Tensor) -> bool:
-        """Whether the arms are, where anything is known of that."""
-        return self._clearance is None or self._clearance.nearest(self.angles(at))[1] is None
+    def is_clear(self, at: Tensor) -> bool:
+        """Return whether the arms stay clear; always true without a clearance check."""
+        return self._clearance is None or self._clearance.smallest_gap(self.joint_angles(at))[1] is None
 
-    def nearest(self, at: Tensor) -> Gap | None:
-        """The smallest distance between solids on the way; None: nothing is known of that."""
-        return None if self._clearance is None else self._clearance.nearest(self.angles(at))[0]
+    def smallest_gap(self, at: Tensor) -> Gap | None:
+        """Return the smallest distance between solids along the motion; None without a clearance check."""
+        return None if self._clearance is None else self._clearance.smallest_gap(self.joint_angles(at))[0]
 
-    def angles(self, at: Tensor) -> dict[str, Tensor]:
-        """[N, J] rad, by arm, at the instants of ``Span``."""
-        return {c.name: c.at_instants(z) for c, z in zip(self.courses, self.split(at), strict=True)}
+    def joint_angles(self, at: Tensor) -> dict[str, Tensor]:
+        """Return joint angles [N, J] rad by arm at ``SplineSpan.bound_check_times``."""
+        waypoints = self.split_waypoints(at)
+        return {m.name: m.coordinates_at_check_times(z) for m, z in zip(self.motions, waypoints, strict=True)}
 
-    def each(self, at: Tensor) -> tuple[list[float], Tensor]:
-        """(distance [m] of every model, [T, V, 3] m of the first one's cloth)."""
+    def evaluate_models(self, at: Tensor) -> tuple[list[float], Tensor]:
+        """Return the distance [m] of every model, and the frames [T, V, 3] m of the first one."""
         with torch.no_grad():
-            runs = [r.run(self.motion(at)) for r in self.rehearsals]
-        return [float(aim.distance(x[-1])) for aim, x in zip(self.aims, runs, strict=True)], runs[0]
+            runs = [model.simulate(self.motion(at)) for model in self.forward_models]
+        distances = [
+            float(objective.distance(frames[-1])) for objective, frames in zip(self.objectives, runs, strict=True)
+        ]
+        return distances, runs[0]
 
-    def _ask(self, question: str, at: Tensor, work: Callable[[], T]) -> T:
-        return work() if self._journal is None else self._journal.ask(question, at, work)
+    def _compute(self, question: str, at: Tensor, work: Callable[[], T]) -> T:
+        return work() if self._store is None else self._store.get_or_compute(question, at, work)
 
-    def _look(self, at: Tensor) -> tuple[Tensor, Tensor]:
+    def _evaluate(self, at: Tensor) -> tuple[Tensor, Tensor]:
         motion = self.motion(at)
-        ends = [(aim, r.run(motion)[-1]) for aim, r in zip(self.aims, self.rehearsals, strict=True)]
-        distance = torch.stack([aim.distance(x) for aim, x in ends]).mean()
-        return distance, torch.tensor([aim.square(x) for aim, x in ends]).mean()
+        final = [(o, model.simulate(motion)[-1]) for o, model in zip(self.objectives, self.forward_models, strict=True)]
+        distance = torch.stack([objective.distance(x) for objective, x in final]).mean()
+        return distance, torch.tensor([objective.mean_square(x) for objective, x in final]).mean()
 
-    def _pull(self, at: Tensor) -> Pull:
-        motion, moved = self.motion(at), self._moved(at)
+    def _quadratic_model(self, at: Tensor) -> QuadraticModel:
+        motion, pose_derivatives = self.motion(at), self._pose_derivatives(at)
         parts = []
-        for aim, r in zip(self.aims, self.rehearsals, strict=True):
-            parts.append(aim.pull(*r.last(motion, moved)))
-        return mean(parts)
+        for objective, model in zip(self.objectives, self.forward_models, strict=True):
+            parts.append(objective.quadratic_model(*model.linearise_final_shape(motion, pose_derivatives)))
+        return average_models(parts)
 
-    def _slope(self, at: Tensor) -> tuple[Tensor, Tensor]:
-        """One model after the other: the graph of one is all that is in memory at once."""
+    def _distance_gradient(self, at: Tensor) -> tuple[Tensor, Tensor]:
+        """One model after the other, so that only one graph is in memory at a time."""
         values, gradient = [], torch.zeros_like(at)
-        for aim, r in zip(self.aims, self.rehearsals, strict=True):
+        for objective, model in zip(self.objectives, self.forward_models, strict=True):
             with torch.enable_grad():
-                free = at.clone().requires_grad_()
-                distance = aim.distance(r.run(self.motion(free))[-1])
-                gradient += torch.autograd.grad(distance, free)[0].to(gradient) / len(self.rehearsals)
+                unknowns = at.clone().requires_grad_()
+                distance = objective.distance(model.simulate(self.motion(unknowns))[-1])
+                gradient += torch.autograd.grad(distance, unknowns)[0].to(gradient) / len(self.forward_models)
             values.append(distance.detach())
         return torch.stack(values).mean(), gradient
 
-    def _moved(self, at: Tensor) -> dict[str, Tensor]:
-        """[N, S, 4, 4] by gripper: what each unknown does to its poses."""
-        out, done, shapes = {}, 0, self.split(at)
-        for course, z in zip(self.courses, shapes, strict=True):
-            slopes = jacfwd(lambda w, c=course: c.trajectory(w).pose)(z)  # [S, 4, 4, K, C]
-            own = slopes.flatten(3).movedim(3, 0)
-            before, after = (own.new_zeros(n, *own.shape[1:]) for n in (done, len(at) - done - len(own)))
-            out[course.name] = torch.cat([before, own, after])
-            done += len(own)
-        return out
+    def _pose_derivatives(self, at: Tensor) -> dict[str, Tensor]:
+        """Derivatives [N, S, 4, 4] of each gripper's poses by all unknowns."""
+        derivatives, done = {}, 0
+        for motion, waypoints in zip(self.motions, self.split_waypoints(at), strict=True):
+            by_waypoint = jacfwd(lambda w, m=motion: m.trajectory(w).pose)(waypoints)  # [S, 4, 4, K, C]
+            block = by_waypoint.flatten(3).movedim(3, 0)
+            before, after = (block.new_zeros(n, *block.shape[1:]) for n in (done, len(at) - done - len(block)))
+            derivatives[motion.name] = torch.cat([before, block, after])
+            done += len(block)
+        return derivatives
 
-    def _metric(self) -> Tensor:
-        """[N, N] m^2, mean squares over time of how far the paths go, turns at ``LEVER``; at the recorded motion."""
-        total = STIFF * torch.eye(len(self.start), dtype=torch.float64)
-        for own in self._moved(self.start).values():
-            shift, turn = own[:, :, :3, 3].flatten(1), LEVER * own[:, :, :3, :3].flatten(1)
-            total = total + (shift @ shift.mT + 0.5 * turn @ turn.mT) / own.shape[1]
+    def _path_metric(self) -> Tensor:
+        """Metric [N, N] m^2 at the recorded motion: mean square displacement of the grippers over time."""
+        total = METRIC_REGULARISATION_M2 * torch.eye(len(self.start), dtype=torch.float64)
+        for pose in self._pose_derivatives(self.start).values():
+            shift, turn = pose[:, :, :3, 3].flatten(1), ROTATION_LEVER_ARM_M * pose[:, :, :3, :3].flatten(1)
+            total = total + (shift @ shift.mT + 0.5 * turn @ turn.mT) / pose.shape[1]
         return total

@@ -9,15 +9,17 @@ from helpers.planning_scenes import EDGE, LASTS, by_arm, by_hand, cloth_of
 
 from torchcloth import recordings as rec
 from torchcloth.planning import episode_conversion
-from torchcloth.planning.constrained_step import step_within
+from torchcloth.planning.constrained_step import solve_constrained_step
 from torchcloth.planning.episode_conversion import build_planned_episode, extract_motion_parameters, motion_warnings
 from torchcloth.planning.motion_parameters import LinearBounds, SplineSpan, rotation_matrix
-from torchcloth.robots import ACCELERATION, arm_of, replay
-from torchcloth.robots.primitives import Limits
+from torchcloth.robots import DEFAULT_JOINT_ACCELERATION, arm_from_recording, replay
+from torchcloth.robots.primitives import GripperLimits
 
 
-def courses(recording, waypoints=4, wait=0.1, limits=Limits()):  # noqa: B008 - a tuple
-    return extract_motion_parameters(cloth_of(recording), recording, waypoints, wait, ACCELERATION, limits)
+def courses(recording, waypoints=4, wait=0.1, limits=GripperLimits()):  # noqa: B008 - a tuple
+    return extract_motion_parameters(
+        cloth_of(recording), recording, waypoints, wait, DEFAULT_JOINT_ACCELERATION, limits
+    )
 
 
 def test_what_is_added_begins_and_ends_at_rest():
@@ -33,34 +35,36 @@ def test_with_nothing_added_the_motion_is_the_recorded_one():
     for recording in (by_hand(), by_arm()):
         (course,) = courses(recording)
         (path,) = replay(recording).values()
-        own = course.trajectory(course.zero_waypoints)
-        assert torch.allclose(own.pose[: len(path.t)], path.pose, atol=1e-12)
-        assert float(own.t[-1]) == pytest.approx(LASTS + 0.1)
-        assert torch.equal(own.pose[-1], own.pose[len(path.t) - 1])  # it waits where it ends
+        custom = course.trajectory(course.zero_waypoints)
+        assert torch.allclose(custom.pose[: len(path.t)], path.pose, atol=1e-12)
+        assert float(custom.t[-1]) == pytest.approx(LASTS + 0.1)
+        assert torch.equal(custom.pose[-1], custom.pose[len(path.t) - 1])  # it waits where it ends
 
 
 def test_turns_are_rotations():
     turn = torch.tensor([[0.0, 0.0, torch.pi / 2], [0.3, -0.2, 0.1]])
-    found = rotation_matrix(turn)
-    assert torch.allclose(found[0], torch.tensor([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]]), atol=1e-12)
-    assert torch.allclose(found @ found.mT, torch.eye(3).expand(2, 3, 3), atol=1e-12)
-    assert torch.allclose(found[1] @ turn[1], turn[1])
+    result = rotation_matrix(turn)
+    assert torch.allclose(result[0], torch.tensor([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]]), atol=1e-12)
+    assert torch.allclose(result @ result.mT, torch.eye(3).expand(2, 3, 3), atol=1e-12)
+    assert torch.allclose(result[1] @ turn[1], turn[1])
 
 
 def test_limits_hold_between_waypoints_too():
     recording = by_arm()
     (course,) = courses(recording)
-    bounds, arm = LinearBounds.concatenate([course]), arm_of(recording, "arm")
+    bounds, arm = LinearBounds.concatenate([course]), arm_from_recording(recording, "arm")
     at = torch.zeros(course.zero_waypoints.numel())
-    step = step_within(at, -torch.randn(len(at)), torch.eye(len(at)), bounds)
+    step = solve_constrained_step(at, -torch.randn(len(at)), torch.eye(len(at)), bounds)
     assert bounds.nearest_limit(step)[0] > 0.99  # as far as it may go
     q = course.coordinates(step.reshape(4, 7))
     velocity = (q.diff(dim=0) / course.t.diff()[:, None]).abs()
     assert bool((velocity < 1.01 * arm.limits.velocity).all())
-    own = courses(recording)[0].q
-    hardest = ((own[12:] - 2 * own[6:-6] + own[:-12]) / 0.06**2).abs().max()  # what the recorded motion asks for
-    found = ((q[12:] - 2 * q[6:-6] + q[:-12]) / 0.06**2).abs()
-    assert float(found.max()) < 1.05 * max(ACCELERATION, float(hardest))
+    custom = courses(recording)[0].q
+    hardest = (
+        ((custom[12:] - 2 * custom[6:-6] + custom[:-12]) / 0.06**2).abs().max()
+    )  # what the recorded motion asks for
+    result = ((q[12:] - 2 * q[6:-6] + q[:-12]) / 0.06**2).abs()
+    assert float(result.max()) < 1.05 * max(DEFAULT_JOINT_ACCELERATION, float(hardest))
 
 
 def test_a_motion_beyond_the_limits_is_no_reason_to_give_up():
@@ -76,7 +80,7 @@ def test_a_hand_stays_above_the_table():
     bounds = LinearBounds.concatenate([course])
     down = torch.zeros(4, 6)
     down[:, 2] = -1.0
-    step = step_within(torch.zeros(24), -down.flatten(), torch.eye(24), bounds)
+    step = solve_constrained_step(torch.zeros(24), -down.flatten(), torch.eye(24), bounds)
     assert float(course.trajectory(step.reshape(4, 6)).pose[:, 2, 3].min()) == pytest.approx(0.45, abs=1e-3)
 
 
@@ -117,22 +121,26 @@ def test_what_was_recorded_longer_waits_as_well():
 def test_what_is_under_way_at_the_end_comes_to_rest_within_the_limits():
     """It had been stopped in 10 ms."""
     recording = by_arm()
-    own = recording.joints["arm"]
-    q = own.q.copy()
-    q[:, 0] += 0.6 * own.t  # rad/s
-    recording = replace(recording, joints={"arm": replace(own, q=q)})
-    for wait, said in ((0.5, "comes to rest in 0.20 s"), (0.1, "wait 0.20 s or longer")):
-        (course,) = extract_motion_parameters(cloth_of(recording), recording, 4, wait, 3.0, Limits())
+    custom = recording.joints["arm"]
+    q = custom.q.copy()
+    q[:, 0] += 0.6 * custom.t  # rad/s
+    recording = replace(recording, joints={"arm": replace(custom, q=q)})
+    for wait, message in ((0.5, "it takes 0.20 s of the wait to come to rest"), (0.1, "wait 0.20 s or longer")):
+        (course,) = extract_motion_parameters(cloth_of(recording), recording, 4, wait, 3.0, GripperLimits())
         (doubt,) = motion_warnings(recording, [course])
-        assert said in doubt
+        assert message in doubt
         velocity = course.q.diff(dim=0) / course.t.diff()[:, None]
         hardest = (velocity.diff(dim=0)[:, 0] / course.t.diff()[1:])[course.t[:-2] > LASTS - 1e-9].abs().max()
         assert float(hardest) == pytest.approx(3.0 if wait > 0.2 else 6.0, rel=0.1)
         assert torch.equal(velocity[-1], torch.zeros(7)) == (wait > 0.2)
         bounds = LinearBounds.concatenate([course])
-        last = [k for k, name in enumerate(bounds.names) if name == f"acceleration of {course.coordinate_names[0]} of arm"][-1]
+        last = [
+            k for k, name in enumerate(bounds.names) if name == f"acceleration of {course.coordinate_names[0]} of arm"
+        ][-1]
         assert float(bounds.high[last]) < 4.0  # the halt is no recorded motion
-        assert bool((course.span.bound_check_times > LASTS + 0.5 * min(wait, 0.2)).any())  # limits of positions hold there, too
+        assert bool(
+            (course.span.bound_check_times > LASTS + 0.5 * min(wait, 0.2)).any()
+        )  # limits of positions hold there, too
 
 
 def test_a_gripper_that_had_let_go_before_moves_as_recorded():
@@ -164,12 +172,12 @@ def test_accelerations_are_bounded_where_they_are_greatest():
     added = torch.zeros(4, 6)
     added[0, 0] = 1.0
     of_x = [k for k, name in enumerate(bounds.names) if name == "acceleration of x of hand"]
-    found = (bounds.rows @ added.flatten())[of_x]
+    result = (bounds.rows @ added.flatten())[of_x]
     fine = torch.linspace(0.0, LASTS, 4001)
     curve = course.span.basis(fine)[:, 0]
     true = (curve[2:] - 2 * curve[1:-1] + curve[:-2]) / float(fine[1]) ** 2
-    assert float(found[0]) == pytest.approx(float(true[0]), rel=0.01)
-    assert float(found.abs().max()) == pytest.approx(float(true.abs().max()), rel=0.01)
+    assert float(result[0]) == pytest.approx(float(true[0]), rel=0.01)
+    assert float(result.abs().max()) == pytest.approx(float(true.abs().max()), rel=0.01)
 
 
 def test_a_recorded_motion_that_is_under_way_is_no_acceleration():
@@ -184,11 +192,11 @@ def test_a_recorded_motion_that_is_under_way_is_no_acceleration():
 
 
 def test_joints_that_turn_without_end_go_the_short_way(monkeypatch):
-    recording, arm = by_arm(), arm_of(by_arm(), "arm")
+    recording, arm = by_arm(), arm_from_recording(by_arm(), "arm")
     joints = recording.joints["arm"]
     turned = joints.q.copy()
     turned[20:, 6] -= 2 * np.pi  # as encoders say it
-    monkeypatch.setattr(episode_conversion, "arm_of", lambda *_: arm)
+    monkeypatch.setattr(episode_conversion, "arm_from_recording", lambda *_: arm)
     arm.joint_types = (*arm.joint_types[:6], "continuous")
     wrapped = replace(recording, joints={"arm": replace(joints, q=turned)})
     (course,), (plain,) = courses(wrapped), courses(recording)
@@ -196,16 +204,16 @@ def test_joints_that_turn_without_end_go_the_short_way(monkeypatch):
 
 
 def test_an_arm_that_stands_by_need_not_be_known():
-    beside = {"spare": rec.JointMotion(np.arange(5) / 10, np.zeros((5, 6)))}
-    (course,) = courses(replace(by_hand(), joints=beside))
+    adjacent = {"spare": rec.JointMotion(np.arange(5) / 10, np.zeros((5, 6)))}
+    (course,) = courses(replace(by_hand(), joints=adjacent))
     assert course.name == "hand"
-    assert not motion_warnings(replace(by_hand(), joints=beside), [course])
+    assert not motion_warnings(replace(by_hand(), joints=adjacent), [course])
 
 
 def test_of_a_table_that_leans_its_height_below_the_path_is_kept():
     recording = by_hand(table=0.1)
     assert not motion_warnings(recording, courses(recording))
-    for angle, said in ((0.2, "hand: table leans"), (1.2, "hand: table stands too steep")):
+    for angle, message in ((0.2, "hand: table is inclined"), (1.2, "hand: table is too steep")):
         table = replace(recording.colliders["table"], normal=np.array([np.sin(angle), 0.0, np.cos(angle)]))
-        leaning = replace(recording, colliders={"table": table})
-        assert [doubt for doubt in motion_warnings(leaning, courses(leaning)) if doubt.startswith(said)]
+        inclined = replace(recording, colliders={"table": table})
+        assert [w for w in motion_warnings(inclined, courses(inclined)) if w.startswith(message)]
