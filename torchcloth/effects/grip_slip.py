@@ -61,7 +61,7 @@ class GripSlip(AbstractEffect):
         return Coefficients(self.mobility.field, self.hold.field)
 
     def grip_compliance(self, c: Coefficients) -> float:
-        """Return the mobility."""
+        """Return the mobility, [m/(N s)]."""
         return float(c.mobility.detach().max())
 
     def grip_velocities(

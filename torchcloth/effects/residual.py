@@ -105,7 +105,7 @@ class ResidualForce(AbstractEffect):
             raise InvalidInput(
                 "terms", got=", ".join(unknown) or "none", expected=f"LAW or LAW@PLACE, laws {', '.join(RESIDUAL_LAWS)}"
             )
-        self.terms, self.held = tuple(terms), tuple(gripped_vertices)
+        self.terms, self.gripped_vertices = tuple(terms), tuple(gripped_vertices)
         self.strength = PhysicalParameter(
             torch.tensor(list(terms.values()), dtype=torch.get_default_dtype()), "SI", "real", name="residual force"
         )
@@ -124,12 +124,12 @@ class ResidualForce(AbstractEffect):
             InvalidInput: a gripped vertex that the mesh does not have.
         """
         like = {"dtype": torch.get_default_dtype(), "device": self.strength.raw.device}
-        wrong = [k for k in self.held if not 0 <= k < len(mesh.vertices)]
+        wrong = [k for k in self.gripped_vertices if not 0 <= k < len(mesh.vertices)]
         if wrong:
             raise InvalidInput("gripped_vertices", got=f"vertex {wrong[0]}", expected=f"0 to {len(mesh.vertices) - 1}")
         self.triangles.bind(mesh, self.strength.raw.device)
         self.stencil.bind(mesh, device=self.strength.raw.device)
-        weights = torch.as_tensor(_position_weights(mesh, self.held), **like)
+        weights = torch.as_tensor(_position_weights(mesh, self.gripped_vertices), **like)
         self.weights = weights.unsqueeze(-1)
         self.on_triangles = weights[:, torch.as_tensor(mesh.faces)].mean(-1, keepdim=True)
         self.vertex_area = torch.as_tensor(mesh.vertex_area, **like).unsqueeze(-1)

@@ -1,4 +1,4 @@
-"""Distances between simulated surfaces and measured points. Every convention has its own name."""
+"""Distances between simulated surfaces and measured points; every convention has its own name."""
 
 from .surface import ClosestPoints, chamfer_to_surface, find_closest_points, residuals
 from .vertices import chamfer_to_vertices

@@ -1,4 +1,4 @@
-"""Point-to-surface distances: the residuals that identification uses, and the Chamfer distance for reports."""
+"""Point-to-surface distances: residuals for identification, and the Chamfer distance for reports."""
 
 from __future__ import annotations
 
@@ -11,25 +11,31 @@ from .._utils.caching import VersionedTensorCache
 from .._utils.linalg import cross, dot, safe_norm
 from .._utils.torch_modes import disable_autocast
 from .nearest import find_nearest_triangles
-from .shapes import check_points, check_triangles, as_tensor
+from .shapes import as_tensor, check_points, check_triangles
 
 
 class ClosestPoints(NamedTuple):
-    """Closest surface points of N measured points; held constant while differentiating (envelope theorem)."""
+    """Closest points on a surface for N measured points; constant under differentiation (envelope theorem).
 
-    corners: Tensor  # [N, 3] int64, vertices of the triangle that was hit
-    weights: Tensor  # [N, 3] -, barycentric coordinates
-    is_beyond_edge: Tensor  # [N] bool, the point lies beyond the sheet's edge
+    Attributes:
+        corners: [N, 3] int64, vertices of the triangle.
+        weights: [N, 3] -, barycentric coordinates.
+        is_beyond_edge: [N] bool, the measured point lies beyond the edge of the sheet.
+    """
+
+    corners: Tensor
+    weights: Tensor
+    is_beyond_edge: Tensor
 
     def interpolate(self, vertices: Tensor) -> Tensor:
-        """[..., N, 3] m, the material points that were hit, on vertices [..., V, 3]."""
+        """Return the positions of the closest points, [..., N, 3] m, for vertices [..., V, 3] m."""
         picked = vertices.index_select(-2, self.corners.reshape(-1)).unflatten(-2, (-1, 3))
         return (self.weights.unsqueeze(-1) * picked).sum(-2)
 
 
 @disable_autocast()
 def find_closest_points(points: Tensor, vertices: Tensor, faces: Tensor, chunk: int = 4_000_000) -> ClosestPoints:
-    """Exact closest points on a triangle mesh.
+    """Find the exact closest points on a triangle mesh.
 
     Args:
         points: [N, 3] m; N may be 0.
@@ -51,11 +57,18 @@ def find_closest_points(points: Tensor, vertices: Tensor, faces: Tensor, chunk: 
 
 
 def residuals(points: Tensor, vertices: Tensor, closest_points: ClosestPoints) -> tuple[Tensor, Tensor]:
-    """Signed distances [m] of points from the surface, split by direction.
+    """Compute distances [m] of points from the surface, along its normal and in its plane.
+
+    Points beyond the sheet's edge pull the edge outwards. Missing points do not pull it back: occlusion explains them.
+
+    Args:
+        points: [N, 3] m.
+        vertices: [..., V, 3] m, differentiable.
+        closest_points: as ``find_closest_points`` returned them.
 
     Returns:
-        (along the normal [N], for every point; in the surface's plane [N], for points beyond the sheet's edge and 0
-        elsewhere: points beyond pull the edge outwards, missing points do not pull it back, occlusion explains them)
+        Signed distance along the normal [N]; and distance in the surface's plane [N], 0 unless the point lies beyond
+        the sheet's edge.
     """
     points, vertices = as_tensor(points), as_tensor(vertices)
     x0, x1, x2 = vertices.index_select(-2, closest_points.corners.reshape(-1)).unflatten(-2, (-1, 3)).unbind(-2)
@@ -64,19 +77,20 @@ def residuals(points: Tensor, vertices: Tensor, closest_points: ClosestPoints) -
     normal = normal / torch.where(size > 0, size, 1.0)  # a triangle without area has none
     offset = points - closest_points.interpolate(vertices)
     along = dot(normal, offset)
-    beside = offset - along * normal
-    beside = safe_norm(torch.where(closest_points.is_beyond_edge.unsqueeze(-1), beside, torch.zeros_like(beside)))
-    return along.squeeze(-1), beside.squeeze(-1)
+    tangential = offset - along * normal
+    is_beyond = closest_points.is_beyond_edge.unsqueeze(-1)
+    in_plane = safe_norm(torch.where(is_beyond, tangential, torch.zeros_like(tangential)))
+    return along.squeeze(-1), in_plane.squeeze(-1)
 
 
 def chamfer_to_surface(points: Tensor, vertices: Tensor, faces: Tensor) -> Tensor:
-    """One-sided Chamfer distance cloud -> surface [m]: mean over the points of the distance to the nearest triangle.
+    """Compute the one-sided Chamfer distance cloud -> surface [m]: the mean distance to the nearest triangle.
 
-    Differentiable in ``vertices``. Its floor is the sensor noise, and it is blind to motion within the surface: use it
-    to report, and ``residuals`` to infer.
+    It is differentiable in ``vertices``. Its floor is the sensor noise, and it is blind to motion within the surface:
+    use it to report, and ``residuals`` to infer.
 
     Raises:
-        InvalidInput: as `closest`, or no points, which have no mean.
+        InvalidInput: as ``find_closest_points``, or no points.
     """
     points, vertices = as_tensor(points), as_tensor(vertices)
     check_points(points, "points", min_count=1)
@@ -84,19 +98,19 @@ def chamfer_to_surface(points: Tensor, vertices: Tensor, faces: Tensor) -> Tenso
 
 
 def point_distances(points: Tensor, vertices: Tensor, closest_points: ClosestPoints) -> Tensor:
-    """[N] m, of points from the places that they hit; differentiable in ``vertices``."""
+    """Return the distances [N] m of points from their closest points; differentiable in ``vertices``."""
     return safe_norm(as_tensor(points) - closest_points.interpolate(as_tensor(vertices))).squeeze(-1)
 
 
 def _on_boundary(faces: Tensor, face: Tensor, weights: Tensor) -> Tensor:
-    """[N] bool, whether the closest point lies on an edge that only one triangle has, or is an end of one."""
+    """Return [N] bool, whether the closest point lies on an edge of one triangle only, or is an end of one."""
     open_edge, rim = _boundary(faces)
     corner = rim[faces[face].gather(-1, weights.argmax(-1, keepdim=True)).squeeze(-1)] & (weights >= 1).any(-1)
     return ((weights <= 0) & open_edge[face]).any(-1) | corner
 
 
 def _boundary(faces: Tensor) -> tuple[Tensor, Tensor]:
-    """([F, 3] bool, whether the edge opposite to each corner is open; [V] bool, whether a vertex is an end of one)."""
+    """Return [F, 3] bool, is the edge opposite to each corner open; and [V] bool, is the vertex an end of one."""
     return _MESH_BOUNDARIES.get_or_compute(faces, lambda: _find_boundary(faces))
 
 

@@ -7,15 +7,15 @@ from torch import Tensor
 
 from .._utils.linalg import EXACT_CDIST_MODE
 from ..errors import InvalidInput
-from .shapes import check_points, as_tensor
+from .shapes import as_tensor, check_points
 
-MAX_DISTANCES_PER_BLOCK = 4_000_000  # distances
+MAX_DISTANCES_PER_BLOCK = 4_000_000  # that are in memory at the same time
 
 
 def chamfer_to_vertices(points: Tensor, vertices: Tensor) -> Tensor:
-    """One-sided Chamfer distance cloud -> vertices [m]: mean over the points of the distance to the nearest vertex.
+    """Compute the one-sided Chamfer distance cloud -> vertices [m]: the mean distance to the nearest vertex.
 
-    The DiffCP paper's loss. It depends on the mesh density and its floor is about a third of an edge.
+    This is the DiffCP paper's loss. It depends on the mesh density, and its floor is about a third of an edge.
 
     Args:
         points: [N, 3] m.
@@ -30,7 +30,7 @@ def chamfer_to_vertices(points: Tensor, vertices: Tensor) -> Tensor:
     if points.dtype != vertices.dtype:
         raise InvalidInput("points", got=points.dtype, expected=f"the vertices' precision, {vertices.dtype}")
     with torch.no_grad():
-        # by products of the coordinates, distances would lose their digits far from the origin
-        some = points.split(max(1, MAX_DISTANCES_PER_BLOCK // len(vertices)))
-        nearest = torch.cat([torch.cdist(part, vertices, compute_mode=EXACT_CDIST_MODE).argmin(-1) for part in some])
+        # from products of coordinates, distances would have no digits far from the origin
+        blocks = points.split(max(1, MAX_DISTANCES_PER_BLOCK // len(vertices)))
+        nearest = torch.cat([torch.cdist(part, vertices, compute_mode=EXACT_CDIST_MODE).argmin(-1) for part in blocks])
     return (points - vertices[nearest]).norm(dim=-1).mean()

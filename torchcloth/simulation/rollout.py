@@ -18,9 +18,9 @@ from ..dynamics import substep
 from ..dynamics.contact.self_contact import SUBSTEPS_PER_CHECKPOINT
 from ..dynamics.forces import Impulses, add_impulses
 from ..dynamics.model import Model, freeze_parameters
-from ..engine.cuda_graphs import Graphs, unit_of
-from ..engine.dispatch import Choice
-from ..engine.fused import Fused, recomputes
+from ..engine.cuda_graphs import GraphedRollout, segment_length
+from ..engine.dispatch import EngineChoice
+from ..engine.fused import FusedEngine, may_recompute
 from ..errors import SimulationDiverged
 from ..types import ClothState, Rollout, Trajectory
 from .argument_checks import check_extent, check_substeps
@@ -72,13 +72,13 @@ class FrameInterval(NamedTuple):
     start: float
     end: float
     count: int
-    fused: Fused | None = None
+    fused: FusedEngine | None = None
     prescribed: Mapping[str, PrescribedMotion] | None = None
-    graphs: Graphs | None = None
+    graphs: GraphedRollout | None = None
 
     @property
     def dt(self) -> float:
-        """Substep [s]."""
+        """Length of a substep [s]."""
         return (self.end - self.start) / self.count
 
     def substep_times(self) -> Tensor:
@@ -123,11 +123,11 @@ class RolloutSchedule(NamedTuple):
     frames: list[float]
     counts: list[int]
     state: ClothState
-    choice: Choice
+    choice: EngineChoice
     max_extent: float
     step_for: Callable[[ClothState], float] | None = None
     requested_frames: tuple[int, ...] | None = None
-    graphs: Graphs | None = None
+    graphs: GraphedRollout | None = None
 
     def iterate_intervals(self, current_state: Callable[[], ClothState]) -> Iterator[FrameInterval]:
         """Yield the intervals in order, with more substeps where ``step_for`` asks for them.
@@ -152,7 +152,7 @@ class RolloutSchedule(NamedTuple):
         """Yield blocks of intervals that one call of the engine may take, each with its prescribed motion."""
         prescribed, first, last, block = self.sample_motion(), 0, 0, []
         vertices = self.state.x.numel() // 3
-        if self.choice.fused is not None and self.choice.fused.is_elsewhere:
+        if self.choice.fused is not None and self.choice.fused.is_on_device:
             vertices //= SCENES_PER_DEVICE
         max_substeps = MAX_VERTEX_SUBSTEPS_PER_CALL // max(vertices, MIN_COUNTED_VERTICES)
         for interval in (*self._bare_intervals(), None):
@@ -223,7 +223,7 @@ def run_schedule(schedule: RolloutSchedule, checkpoint: bool) -> Rollout:
 
 
 def _run_fused_block(
-    fused: Fused,
+    fused: FusedEngine,
     block: Sequence[FrameInterval],
     state: ClothState,
     compensation: Tensor | None,
@@ -276,7 +276,7 @@ def advance_interval(
     if interval.fused is None:
         state, compensation, total = _run_reference(interval, state, compensation, prescribed, checkpoint)
     else:
-        run = partial(interval.fused.stretch, checkpoint=checkpoint)
+        run = partial(interval.fused.rollout_segment, checkpoint=checkpoint)
         state, compensation, total = run(state, compensation, interval.dt, prescribed, interval.count)
     check_finite(interval, start, state)
     return state, compensation, total
@@ -290,10 +290,10 @@ def _run_reference(
     checkpoint: bool,
 ) -> tuple[ClothState, Tensor | None, Impulses]:
     total: Impulses = {}
-    recomputed = checkpoint and recomputes()
+    recomputed = checkpoint and may_recompute()
     model = freeze_parameters(interval.model) if recomputed else interval.model
     graphs = None if under_torch_transform() else interval.graphs
-    chunk = unit_of(interval.count) if graphs is not None and graphs.able else SUBSTEPS_PER_CHECKPOINT
+    chunk = segment_length(interval.count) if graphs is not None and graphs.is_enabled else SUBSTEPS_PER_CHECKPOINT
     for first in range(0, interval.count, chunk):
         segment = {
             "dt": interval.dt,
@@ -326,7 +326,7 @@ def check_finite(interval: FrameInterval, start: ClothState, end: ClothState) ->
 @torch.no_grad()
 def _find_divergence(interval: FrameInterval, state: ClothState, end: ClothState) -> SimulationDiverged:
     prescribed, k, compensation = interval.sample_motion(), 0, None
-    run = partial(substep.rollout_segment, interval.model) if interval.fused is None else interval.fused.stretch
+    run = partial(substep.rollout_segment, interval.model) if interval.fused is None else interval.fused.rollout_segment
     for k in range(interval.count):
         state, compensation, _ = run(state, compensation, interval.dt, _slice(prescribed, k, k + 1), 1)
         if not bool(torch.isfinite(state.x).all()):

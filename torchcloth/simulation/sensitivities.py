@@ -286,9 +286,7 @@ def _dense_tangent(t: Tensor) -> Tensor:
     return torch.zeros_like(t) if tangent is None else tangent.clone()
 
 
-def _check_directions(
-    along: Directions, cloth: nn.Module, state: ClothState, motion: Mapping[str, Trajectory]
-) -> int:
+def _check_directions(along: Directions, cloth: nn.Module, state: ClothState, motion: Mapping[str, Trajectory]) -> int:
     """Return K, the same for all directions.
 
     Raises:
