@@ -44,7 +44,7 @@ class BuildWithEngine(build_py):
                 part = folder / f".{library.name}"  # a process that loads half a library dies
                 shutil.copyfile(library, part)
                 os.replace(part, folder / library.name)
-        except (building.Unbuilt, OSError) as miss:
+        except (building.EngineUnavailable, OSError) as miss:
             if PREBUILD == "portable":
                 raise
             print(f"torchcloth: the engine is not built now: {miss}", file=sys.stderr)

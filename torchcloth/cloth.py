@@ -21,8 +21,16 @@ from .dynamics.kinematics import Geometry, vertex_mass
 from .dynamics.model import Model
 from .dynamics.stability import check_precision, stability_limits
 from .effects import AbstractEffect
-from .engine.cuda_graphs import Graphs
-from .engine.dispatch import TRIED, Choice, Setting, Trial, check_setting, choose, still_drives
+from .engine.cuda_graphs import GraphedRollout
+from .engine.dispatch import (
+    SELF_TEST_SUBSTEPS,
+    EngineChoice,
+    SelfTest,
+    Setting,
+    check_setting,
+    choose_engine,
+    stationary_prescribed,
+)
 from .errors import TorchclothError
 from .materials import AbstractMaterial
 from .meshes import Mesh
@@ -373,7 +381,7 @@ class Cloth(nn.Module):
         if MATERIAL_MEMORY_KEY in state.memory:
             frames, counts, requested_frames = subdivide_intervals(frames, counts)
             step_for = self._step_for(model, dt)
-        graphs = Graphs(model, sum(counts)) if choice.captured else None
+        graphs = GraphedRollout(model, sum(counts)) if choice.uses_cuda_graphs else None
         schedule = RolloutSchedule(
             model, motion, frames, counts, state, choice, max_extent, step_for, requested_frames, graphs
         )
@@ -389,12 +397,14 @@ class Cloth(nn.Module):
 
         return longest_step
 
-    def _choose_engine(self, model: Model, state: ClothState, dt: float | None = None) -> Choice:
+    def _choose_engine(self, model: Model, state: ClothState, dt: float | None = None) -> EngineChoice:
         """Choose the engine; ``dt`` is the substep [s], or None if no substep will be run."""
-        trial = None
+        self_test = None
         if dt is not None:
-            trial = Trial(partial(random_contact_state, model, self._vertices, TRIED * dt / 2), dt / 2)
-        return choose(self.engine, model, state, still_drives(model), trial)
+            self_test = SelfTest(
+                partial(random_contact_state, model, self._vertices, SELF_TEST_SUBSTEPS * dt / 2), dt / 2
+            )
+        return choose_engine(self.engine, model, state, stationary_prescribed(model), self_test)
 
     def extra_repr(self) -> str:
         """Return the data sheet: size, contact, stable step and engine."""

@@ -25,8 +25,8 @@ def _engine(request):
 @pytest.fixture(autouse=True, scope="session")
 def _stand_ins(tmp_path_factory):
     """Where programs for a device that are compiled here lie."""
-    own = tmp_path_factory.getbasetemp()
-    shared = (own.parent if "PYTEST_XDIST_WORKER" in os.environ else own) / "stand-ins"
+    base = tmp_path_factory.getbasetemp()
+    shared = (base.parent if "PYTEST_XDIST_WORKER" in os.environ else base) / "stand-ins"
     shared.mkdir(exist_ok=True)
     cuda_on_host.SHARED[:] = [shared]
 
@@ -36,6 +36,6 @@ def team(request, monkeypatch):
     """As many threads within one scene, however little there is to do for them."""
     before = torch.get_num_threads()
     torch.set_num_threads(request.param)
-    monkeypatch.setattr(execution, "WORTH", 1e-9)
+    monkeypatch.setattr(execution, "MIN_OPS_PER_THREAD", 1e-9)
     yield request.param
     torch.set_num_threads(before)

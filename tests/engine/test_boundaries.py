@@ -22,7 +22,7 @@ from torchcloth.boundaries.motion import sample_trajectory
 from torchcloth.dynamics import substep
 from torchcloth.effects import AddedMass, Gravity, GripSlip, LineMass
 from torchcloth.engine import fused
-from torchcloth.engine.lowering import Unfused
+from torchcloth.engine.builder import UnsupportedPart
 
 
 def turned(z: float, angle: float = 0.3) -> Tensor:
@@ -141,9 +141,9 @@ def test_contact_points_of_uneven_mass():
 
 def run(cloth, state, substeps=20):
     times = torch.linspace(0, 1e-4 * substeps, substeps + 1, dtype=torch.float64)
-    drives = {name: sample_trajectory(trajectory, times) for name, trajectory in moves(cloth).items()}
+    prescribed = {name: sample_trajectory(trajectory, times) for name, trajectory in moves(cloth).items()}
     with torch.no_grad():
-        return fused.rollout(cloth.build_model(), state, 1e-4, drives, substeps)[0]
+        return fused.rollout(cloth.build_model(), state, 1e-4, prescribed, substeps)[0]
 
 
 def test_no_fast_point_is_missed():
@@ -246,18 +246,18 @@ class Greasy(Coulomb):
 @pytest.mark.parametrize(("boundary", "named"), [(Soft(), "Soft"), (Plane(friction=Greasy(0.1)), "Greasy")])
 def test_what_users_write_is_named(boundary, named):
     cloth = sheet({"mine": boundary})
-    with pytest.raises(Unfused, match=f"'mine'.*{named}"):
+    with pytest.raises(UnsupportedPart, match=f"'mine'.*{named}"):
         fused.rollout(cloth.build_model(), cloth.rest_state(), 1e-4, {}, 1)
 
 
 def test_float32():
     """Gradients of a sheet that touches a sampled box, over 200 substeps."""
-    found = []
+    results = []
     for dtype in (torch.float32, torch.float64):
         torch.set_default_dtype(dtype)
         cloth = sheet({"box": SMALL["box"](sampling=0.01)})
         state = falling(cloth.double(), 5e-4).map(lambda t, dtype=dtype: t.to(dtype).requires_grad_())
         end = fused.rollout(cloth.to(dtype).build_model(), state, 1e-4, {}, 200)[0]
         (100 * end.x.square().sum() + end.v.square().sum()).backward()
-        found.append(torch.cat([state.x.grad.flatten() * 1e-4, state.v.grad.flatten()]).double())
-    assert float((found[0] - found[1]).norm() / found[1].norm()) < 1e-3
+        results.append(torch.cat([state.x.grad.flatten() * 1e-4, state.v.grad.flatten()]).double())
+    assert float((results[0] - results[1]).norm() / results[1].norm()) < 1e-3

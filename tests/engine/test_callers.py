@@ -28,8 +28,8 @@ def test_threads_do_not_disturb_each_other():
     cases = [(1e4 * (1 + k % 7), drag) for k in range(8) for drag in (0.0, 1.0)]
     with ThreadPoolExecutor(8) as pool:
         together = list(pool.map(lambda case: fallen(*case), cases))
-    for case, found in zip(cases, together, strict=True):
-        assert torch.equal(found, fallen(*case)), case
+    for case, results in zip(cases, together, strict=True):
+        assert torch.equal(results, fallen(*case)), case
 
 
 def folded(stiffness: float) -> list[torch.Tensor]:
@@ -49,5 +49,5 @@ def test_one_program_serves_many_at_once():
     with ThreadPoolExecutor(6, initializer=torch.set_num_threads, initargs=(1,)) as pool:
         together = list(pool.map(folded, cases))
     alone = {stiffness: folded(stiffness) for stiffness in set(cases)}
-    for stiffness, found in zip(cases, together, strict=True):
-        assert all(torch.equal(a, b) for a, b in zip(found, alone[stiffness], strict=True)), stiffness
+    for stiffness, results in zip(cases, together, strict=True):
+        assert all(torch.equal(a, b) for a, b in zip(results, alone[stiffness], strict=True)), stiffness

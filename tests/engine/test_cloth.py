@@ -9,8 +9,8 @@ from helpers.engine_cloths import close, opening, sheet, start
 import torchcloth as tc
 from torchcloth.boundaries import AbstractBoundary
 from torchcloth.engine import execution
-from torchcloth.engine.dispatch import choose, still_drives
-from torchcloth.engine.fused import Fused
+from torchcloth.engine.dispatch import choose_engine, stationary_prescribed
+from torchcloth.engine.fused import FusedEngine
 from torchcloth.errors import InvalidInput, SimulationDiverged
 
 END = 0.012
@@ -100,25 +100,25 @@ def test_float32():
 def test_slivers_in_float32(thin):
     """Of a triangle squeezed to next to nothing, det(F^T F) has no digits left: forces are the reference's."""
     torch.set_default_dtype(torch.float32)
-    found = []
+    results = []
     for engine in ("reference", "fused"):
         cloth = tc.Cloth(tc.meshes.rectangle(0.1, 0.1, resolution=(2, 2)), tc.materials.AEP(1e4, 0.3), 0.2)
         cloth.engine = engine
         rest, squeezed = cloth.rest_state(), torch.tensor([[1.0, 1.0, 0.0], [1.0, 1.0 + thin, 0.0], [0.0, 0.0, 1.0]])
         state = cloth.state(rest.x @ squeezed)
-        found.append(cloth(state, times=(0.0, 1e-5), dt=1e-5).v[-1])
-    assert bool(found[1].isfinite().all())
-    close(found[1], found[0], 1e-2, "velocity")
+        results.append(cloth(state, times=(0.0, 1e-5), dt=1e-5).v[-1])
+    assert bool(results[1].isfinite().all())
+    close(results[1], results[0], 1e-2, "velocity")
 
 
 @pytest.mark.parametrize("budget", [0, 40_000, 10**9])
 def test_memory_budget_changes_nothing(budget, monkeypatch):
     """No records at all, some, all: the same gradients to the last digit but the order of sums."""
     expected = outcome("fused", times=(0.0, 0.003, 0.006, END))[1]
-    monkeypatch.setattr(execution, "BUDGET", budget)
-    monkeypatch.setattr(execution, "ANEW", budget)
-    found = outcome("fused", times=(0.0, 0.003, 0.006, END))[1]
-    for name, grad in found.items():
+    monkeypatch.setattr(execution, "RECORD_BUDGET_BYTES", budget)
+    monkeypatch.setattr(execution, "RECOMPUTE_BUDGET_BYTES", budget)
+    results = outcome("fused", times=(0.0, 0.003, 0.006, END))[1]
+    for name, grad in results.items():
         assert (grad is None) == (expected[name] is None), name
         if grad is not None:
             close(grad, expected[name], 1e-12, name)
@@ -126,27 +126,35 @@ def test_memory_budget_changes_nothing(budget, monkeypatch):
 
 def test_records_are_kept_while_the_budget_lasts(monkeypatch):
     """Three intervals, room for the records of one and a half: the first keeps, the others go through it again."""
-    cloth, kept = sheet("fused"), []
-    model, state = cloth.model(), start(cloth)
-    drives = still_drives(model, 9)
-    size = execution.full_size(Fused(model, state, drives).low.program, 1, 9)
-    monkeypatch.setattr(execution, "BUDGET", int(1.5 * size))
-    fused, forward = Fused(model, state, drives), execution.forward
-    monkeypatch.setattr(execution, "forward", lambda job, every=0: kept.append(every) or forward(job, every))
+    cloth, intervals = sheet("fused"), []
+    model, state = cloth.build_model(), start(cloth)
+    prescribed = stationary_prescribed(model, 9)
+    size = execution.full_size(FusedEngine(model, state, prescribed).builder.program, 1, 9)
+    monkeypatch.setattr(execution, "RECORD_BUDGET_BYTES", int(1.5 * size))
+    fused, forward = FusedEngine(model, state, prescribed), execution.forward
+    monkeypatch.setattr(
+        execution,
+        "forward",
+        lambda job, record_interval=0: intervals.append(record_interval) or forward(job, record_interval),
+    )
     for _ in range(3):
-        state, _ = fused.rollout(state, 1e-4, drives, 9)
-    assert kept == [1, 0, 0]
+        state, _ = fused.rollout(state, 1e-4, prescribed, 9)
+    assert intervals == [1, 0, 0]
     state.x.sum().backward()
-    assert kept == [1, 0, 0, 1, 1]
+    assert intervals == [1, 0, 0, 1, 1]
 
 
 def test_a_loop_without_gradients_keeps_no_records(monkeypatch):
-    kept, forward = [], execution.forward
-    monkeypatch.setattr(execution, "forward", lambda job, every=0: kept.append(every) or forward(job, every))
+    intervals, forward = [], execution.forward
+    monkeypatch.setattr(
+        execution,
+        "forward",
+        lambda job, record_interval=0: intervals.append(record_interval) or forward(job, record_interval),
+    )
     cloth = sheet("fused")
     with torch.no_grad():
         cloth(start(cloth), opening(END), TIMES)
-    assert set(kept) == {0}
+    assert set(intervals) == {0}
 
 
 # -- changes between calls --------------------------------------------------------------------------------------------
@@ -183,15 +191,15 @@ def changes():
 
 @pytest.mark.parametrize("change", changes(), ids=lambda f: f.__name__)
 def test_changes_between_calls_are_seen(change):
-    """Programs are kept between calls, but never one that is no longer right."""
-    found = {}
+    """Programs are intervals between calls, but never one that is no longer right."""
+    results = {}
     for engine in ("fused", "reference"):
         cloth = sheet(engine)
         before = cloth(start(cloth), opening(END), TIMES).x.detach()
         change(cloth)
-        found[engine] = cloth(start(cloth), opening(END), TIMES).x.detach()
-        assert not torch.equal(before, found[engine])
-    close(found["fused"], found["reference"], 1e-10, change.__name__)
+        results[engine] = cloth(start(cloth), opening(END), TIMES).x.detach()
+        assert not torch.equal(before, results[engine])
+    close(results["fused"], results["reference"], 1e-10, change.__name__)
 
 
 def test_the_engine_may_be_set_at_any_time():
@@ -221,12 +229,12 @@ def test_print_says_which_engine_runs_and_why():
 
 def test_other_precisions_and_devices_are_left_to_the_reference():
     cloth = sheet()
-    model, state = cloth.model(), cloth.rest_state()
+    model, state = cloth.build_model(), cloth.rest_state()
     for other, why in (
         (state.map(lambda t: t.half()), "float16"),
         (state.map(lambda t: t.to("meta")), "tensors on meta"),
     ):
-        assert str(choose("auto", model, other, still_drives(model))) == f"reference ({why})"
+        assert str(choose_engine("auto", model, other, stationary_prescribed(model))) == f"reference ({why})"
 
 
 def test_unknown_boundary_runs_on_the_reference_without_a_warning():

@@ -7,13 +7,13 @@ import numpy as np
 import pytest
 import torch
 import torch.autograd.forward_ad as forward_ad
-from helpers.engine_agreement import agree, difference, held, noise, outcome
+from helpers.engine_agreement import agree, difference, moving_hand, noise, outcome
 
 import torchcloth as tc
 from torchcloth.dynamics import substep
 from torchcloth.dynamics.contact import self_contact
 from torchcloth.engine import execution, fused
-from torchcloth.simulation.sensitivities import RATE, Directions
+from torchcloth.simulation.sensitivities import SETTLING_DAMPING_RATE_PER_S, Directions
 
 SPACING, PLAY = 0.012, 0.25
 
@@ -44,14 +44,14 @@ def pressed(cloth, count, scenes=(), sideways=1.0, down=-1.0, steps=60):
     v[..., count:, 2] += down
     v[..., count:, 0] += sideways * (rest[count:, 1] > 0.05)
     with torch.no_grad():
-        state, _ = substep.rollout(cloth.model(), cloth.state(x, v), 1e-4, {}, steps)
+        state, _ = substep.rollout(cloth.build_model(), cloth.state(x, v), 1e-4, {}, steps)
     memory = {"contact": state.memory["contact"] + noise(state.memory["contact"].shape, 3).to(rest)}
     return state._replace(d3=state.d3 * (1 + 0.05 * noise((*state.d3.shape[:-1], 1), 6).to(rest)), memory=memory)
 
 
 def branches(cloth, state) -> dict[str, int]:
     """How many points are in which branch of the law."""
-    model = cloth.model()
+    model = cloth.build_model()
     n = substep.surface(model.geometry, state.x, state.v).n.repeat_interleave(len(model.grid.points), -2)
     c = cloth.material.coefficients()
     each, faces = len(model.grid.points), len(model.geometry.area)
@@ -73,9 +73,9 @@ def branches(cloth, state) -> dict[str, int]:
 def test_pressed_and_sliding(subdivisions):
     cloth, count = layers(tc.Contact(spacing=SPACING, subdivisions=subdivisions))
     state = pressed(cloth, count)
-    found = branches(cloth, state)
-    assert min(found.values()) > 3, found
-    print(found, agree(cloth, {}, state))
+    results = branches(cloth, state)
+    assert min(results.values()) > 3, results
+    print(results, agree(cloth, {}, state))
 
 
 @pytest.mark.usefixtures("team")
@@ -92,11 +92,11 @@ def test_with_air_hand_and_woven_cloth():
         boundaries={"hand": tc.boundaries.Grasp([9, 10, 30])},
         woven=True,
     )
-    print(agree(cloth, {"hand": held(0.01)}, pressed(cloth, count)))
+    print(agree(cloth, {"hand": moving_hand(0.01)}, pressed(cloth, count)))
 
 
 def test_everywhere():
-    cloth, count = layers(tc.Contact(spacing=SPACING, everywhere=True, play=0.0, damping=0.0))
+    cloth, count = layers(tc.Contact(spacing=SPACING, everywhere=True, free_compression=0.0, damping=0.0))
     print(agree(cloth, {}, pressed(cloth, count, steps=40), substeps=60))
 
 
@@ -117,10 +117,10 @@ def folded(contact):
 def test_triangles_come_and_go():
     """Searches in between wake some triangles and put others to sleep, at the start of a chunk and within one."""
     cloth, state = folded(tc.Contact(spacing=SPACING))
-    model, now, known, seen = cloth.model(), state, None, []
+    model, now, known, seen = cloth.build_model(), state, None, []
     with torch.no_grad():
         for _ in range(60):
-            before, known = known, self_contact.near_layers(model, model.grid, now.x, known)
+            before, known = known, self_contact.find_contact_candidates(model, model.grid, now.x, known)
             if before is not known:
                 seen.append(set(known.active.tolist()))
             now, _ = substep.step(model, now, 5e-5, {}, 0, known)
@@ -138,11 +138,11 @@ def test_a_sheet_alone_is_bitwise_one_without_contact():
         cloth = tc.Cloth(mesh, tc.materials.AEP(6e4), 0.15, {"gravity": tc.effects.Gravity()}, {}, contact)
         x = torch.as_tensor(mesh.vertices).clone()
         x[:, 2] = 0.02 * torch.sin(20 * x[:, 0])
-        runs.append(fused.rollout(cloth.model(), cloth.state(x), 1e-4, {}, 100)[0])
+        runs.append(fused.rollout(cloth.build_model(), cloth.state(x), 1e-4, {}, 100)[0])
     assert torch.equal(runs[0].x, runs[1].x)
     assert torch.equal(runs[0].v, runs[1].v)
-    normals = substep.surface(cloth.model().geometry, runs[1].x, runs[1].v).n
-    assert difference(runs[1].d3, normals.repeat_interleave(cloth.grid().points.shape[0], 0)) < 1e-12
+    normals = substep.surface(cloth.build_model().geometry, runs[1].x, runs[1].v).n
+    assert difference(runs[1].d3, normals.repeat_interleave(cloth.contact_grid().points.shape[0], 0)) < 1e-12
 
 
 def test_batch():
@@ -160,14 +160,14 @@ def test_batch():
 def test_recomputed_substeps_are_bitwise_the_recorded_ones():
     cloth, state = folded(tc.Contact(spacing=SPACING))
     with torch.no_grad():
-        job = fused.Fused(cloth.model(), state, {}).job(state, torch.full((120,), 5e-5), {})
-    found = []
+        job = fused.FusedEngine(cloth.build_model(), state, {}).job(state, torch.full((120,), 5e-5), {})
+    results = []
     for every in (1, 7, 120):
         results, records = execution.forward(job, every)
         seeds = {f: noise(t.shape, k, t.dtype) for k, (f, t) in enumerate(results.items())}
-        found.append(execution.reverse(job, records, every, seeds, set(job.inputs)))
-    for other in found[1:]:
-        assert all(torch.equal(value, other[f]) for f, value in found[0].items())
+        results.append(execution.reverse(job, records, every, seeds, set(job.inputs)))
+    for other in results[1:]:
+        assert all(torch.equal(value, other[f]) for f, value in results[0].items())
 
 
 @pytest.fixture
@@ -180,15 +180,17 @@ def _restored():
 @pytest.mark.usefixtures("_restored")
 def test_single_precision():
     """Gradients of 1000 substeps of layers that slide on each other, in float32 and in float64."""
-    found = []
+    results = []
     for dtype in (torch.float64, torch.float32):
         torch.set_default_dtype(dtype)
         cloth, count = layers(tc.Contact(spacing=SPACING))
-        start = pressed(cloth, count, sideways=0.3, down=-0.2) if not found else found[0][1].map(lambda t: t.float())
+        start = (
+            pressed(cloth, count, sideways=0.3, down=-0.2) if not results else results[0][1].map(lambda t: t.float())
+        )
         gradients = outcome(fused.rollout, cloth, {}, start, 1000, 2e-5).gradients
-        found.append(({k: g.double() for k, g in gradients.items() if g is not None}, start))
-    for name, exact in found[0][0].items():
-        rough = found[1][0][name]
+        results.append(({k: g.double() for k, g in gradients.items() if g is not None}, start))
+    for name, exact in results[0][0].items():
+        rough = results[1][0][name]
         error = float((rough - exact).norm() / exact.norm())
         cosine = float((rough * exact).sum() / rough.norm() / exact.norm())
         print(name, error, 1 - cosine)
@@ -203,7 +205,7 @@ def test_layers_that_pressed_on_each_other_while_they_settled_have_stopped():
     along = Directions(parameters={"areal_density.raw": torch.ones(1, *cloth.areal_density.raw.shape)})
     value, _ = cloth.sensitivities(state, {}, (0.0, 0.002), along=along, settle=0.01)
     with torch.no_grad():
-        settled = cloth.settle(state, duration=0.01, rate=RATE)
+        settled = cloth.settle(state, duration=0.01, rate=SETTLING_DAMPING_RATE_PER_S)
         expected = cloth(settled, times=(0.0, 0.002))
     assert difference(value.v, expected.v) < 1e-10
 

@@ -12,12 +12,12 @@ from helpers.engine_cloths import opening, sheet, start
 
 import torchcloth as tc
 from torchcloth.boundaries.motion import sample_trajectory
-from torchcloth.engine import devices, dispatch, execution, fields
-from torchcloth.engine.building import Unbuilt
+from torchcloth.engine import devices, dispatch, enums, execution
+from torchcloth.engine.building import EngineUnavailable
 from torchcloth.engine.cuda import kernel_codegen, launch, program_ir, self_test
-from torchcloth.engine.fused import Fused
+from torchcloth.engine.fused import FusedEngine
 from torchcloth.engine.library import kernels
-from torchcloth.simulation.initial_state import pressed
+from torchcloth.simulation.initial_state import random_contact_state
 
 pytestmark = pytest.mark.filterwarnings("error:the engine on")
 TIMES = [0.0, 0.01, 0.02]
@@ -26,17 +26,17 @@ TIMES = [0.0, 0.01, 0.02]
 @contextmanager
 def elsewhere(**how):
     """Tensors of the CPU are a device's."""
-    with cuda_on_host.stand_in(**how), patch.object(devices, "elsewhere", lambda tensor: True):
+    with cuda_on_host.stand_in(**how), patch.object(devices, "is_on_device", lambda tensor: True):
         yield
 
 
 def job_of(cloth, scenes=(2,), substeps=12, state=None):
     state, dt = moving(cloth, scenes) if state is None else state, 1e-4
     times = torch.arange(substeps + 1, dtype=torch.float64) * dt
-    drives = {name: sample_trajectory(t, times) for name, t in opening(float(times[-1])).items()}
-    with patch.object(devices, "elsewhere", lambda tensor: True):
-        fused = Fused(cloth.model(), state, drives)
-    job = fused.job(state, torch.full((substeps,), dt), drives)
+    prescribed = {name: sample_trajectory(t, times) for name, t in opening(float(times[-1])).items()}
+    with patch.object(devices, "is_on_device", lambda tensor: True):
+        fused = FusedEngine(cloth.build_model(), state, prescribed)
+    job = fused.job(state, torch.full((substeps,), dt), prescribed)
     return job._replace(inputs={f: t.detach().contiguous() for f, t in job.inputs.items()})
 
 
@@ -53,12 +53,12 @@ def adjoints(job):
 def test_order_of_threads_between_waits_does_not_matter(meets):
     """Bit by bit: nobody reads what another thread of a block writes before both have waited."""
     cloth = sheet(contact=tc.Contact(), n=17) if meets else sheet()
-    job, found = job_of(cloth, state=folded(cloth) if meets else None), []
+    job, results = job_of(cloth, state=folded(cloth) if meets else None), []
     for reverse in (False, True):
         with cuda_on_host.stand_in(4, reverse):
-            found.append((launch.forward(job)[0], adjoints(job)))
+            results.append((launch.forward(job)[0], adjoints(job)))
             assert bool(launch.forward(job)[1][:, :-1].any()) == meets, "layers that meet"
-    for one, other in zip(*found, strict=True):
+    for one, other in zip(*results, strict=True):
         assert all(torch.equal(t, other[f]) for f, t in one.items())
 
 
@@ -66,7 +66,7 @@ def test_adjoints_do_not_depend_on_how_many_substeps_are_kept():
     job = job_of(sheet())
     with cuda_on_host.stand_in():
         usual = adjoints(job)
-        with patch.object(launch, "MOST", 5):
+        with patch.object(launch, "MAX_CHUNK_SUBSTEPS", 5):
             other = adjoints(job)
     for f, t in usual.items():
         torch.testing.assert_close(other[f], t, rtol=0, atol=1e-12 * float(t.abs().max()))
@@ -122,7 +122,7 @@ def test_layers_that_meet():
     """Folded, pressed by a hand and falling; values and gradients through the cloth."""
     hand = tc.boundaries.Sphere(0.05, (0.0, 0.1, 0.07), moving=True)
     cloth = sheet(contact=tc.Contact(), n=17, boundaries={"hand": hand})
-    found = []
+    results = []
     for where in (nullcontext(), elsewhere()):
         with where:
             state = folded(cloth)
@@ -135,8 +135,8 @@ def test_layers_that_meet():
             torch.testing.assert_close(plain, out.x, rtol=0, atol=1e-12)
             (out.x[-1].square().sum() + out.state.d3[:, 2].sum()).backward()
         named = {name: p.grad for name, p in cloth.named_parameters() if p.grad is not None}
-        found.append({"end": out.x[-1].detach(), "d3": out.state.d3.detach(), "x": x.grad} | named)
-    known, there = found
+        results.append({"end": out.x[-1].detach(), "d3": out.state.d3.detach(), "x": x.grad} | named)
+    known, there = results
     assert float(known["material.contact_stiffness.raw"].abs()) > 0
     assert set(there) == set(known)
     for name, t in known.items():
@@ -155,10 +155,10 @@ def test_what_diverges_is_told():
 def test_too_many_nodes_are_an_error(monkeypatch):
     cloth = sheet(contact=tc.Contact(), n=17, boundaries={})
     small = property(lambda self: 16)
-    monkeypatch.setattr(self_test, "agrees", lambda job, rounding: True)  # it has enough for its own
+    monkeypatch.setattr(self_test, "matches_cpu", lambda job, rounding: True)  # it has enough for its own
     with (
         elsewhere(),
-        patch.object(program_ir.Layers, "room", small),
+        patch.object(program_ir.ContactSearch, "node_slots", small),
         pytest.raises(tc.errors.InvalidInput, match="nodes"),
     ):
         cloth(folded(cloth), times=TIMES)
@@ -171,7 +171,7 @@ def test_what_it_cannot_do_is_said():
     for effects, contact in (({"own": Own()}, None), ({"own": Own()}, tc.Contact())):
         with elsewhere():
             assert "effects.own in torch, on cuda" in sheet(effects=effects, contact=contact).engine_in_use
-    with elsewhere(), patch.object(launch, "kernels", side_effect=Unbuilt("no libnvrtc", "install it")):
+    with elsewhere(), patch.object(launch, "kernels", side_effect=EngineUnavailable("no libnvrtc", "install it")):
         with pytest.warns(UserWarning, match="no libnvrtc: simulations run on the torch reference"):
             assert sheet().engine_in_use == "reference (no libnvrtc)"
         with pytest.raises(tc.errors.InvalidInput, match=r"no libnvrtc.*install it"):
@@ -183,13 +183,13 @@ def test_a_device_is_tried_once(dtype, monkeypatch):
     """On a fold that is pressed; one that does something else is not believed."""
     torch.set_default_dtype(dtype)
     cloth = sheet(contact=tc.Contact(), n=17).to(dtype)
-    tried, forward, agrees = [], launch.forward, self_test.agrees
+    tried, forward, agrees = [], launch.forward, self_test.matches_cpu
 
     def watched(job, rounding):
         tried.append(bool(forward(job)[1][:, :-1].any()))
         return agrees(job, rounding)
 
-    monkeypatch.setattr(self_test, "agrees", watched)
+    monkeypatch.setattr(self_test, "matches_cpu", watched)
     for _ in range(2):
         with elsewhere():
             for scenes in ((), (2,)):
@@ -197,22 +197,22 @@ def test_a_device_is_tried_once(dtype, monkeypatch):
             assert cloth.engine_in_use == "fused"
     assert tried == [True, True], "layers met"
 
-    def wrong(job, keep=True):
-        found, masks = forward(job, keep)
-        return {f: 1.1 * t for f, t in found.items()}, masks
+    def wrong(job, keep_masks=True):
+        results, masks = forward(job, keep_masks)
+        return {f: 1.1 * t for f, t in results.items()}, masks
 
-    def failing(job, keep=True):
+    def failing(job, keep_masks=True):
         raise RuntimeError("CUDA: an illegal memory access\nat a place")
 
     for other, said in ((wrong, "is not the CPU's"), (failing, "fails .CUDA: an illegal memory access.")):
         monkeypatch.setattr(launch, "forward", other)
-        dispatch._warn.cache_clear()
+        dispatch._warn_once.cache_clear()
         with elsewhere():
             with pytest.warns(UserWarning, match=f"the engine on cpu {said}: simulations run on the torch reference"):
                 cloth(start(cloth), opening(2e-3), [0.0, 2e-3])
             cloth(start(cloth), opening(2e-3), [0.0, 2e-3])
             assert cloth.engine_in_use.startswith("reference (the engine on cpu ")
-    assert len(tried) == 2 + 2 * dispatch.TRIALS
+    assert len(tried) == 2 + 2 * dispatch.SELF_TEST_SEEDS
 
 
 @pytest.mark.parametrize("contact", [tc.Contact(), None])
@@ -225,8 +225,8 @@ def test_rounding_is_no_reason_to_doubt_a_device(monkeypatch, contact, n, offset
     mesh = tc.meshes.Mesh.build(mesh.vertices + offset, mesh.faces, mesh.uv)
     cloth = tc.Cloth(mesh, tc.materials.AEP(5e4, plastic=tc.materials.NormYield(0.02)), 0.2, contact=contact)
 
-    def rounded(job, keep=True):
-        x, _ = next((f, t) for f, t in job.inputs.items() if f.kind == fields.Kind.STATE)
+    def rounded(job, keep_masks=True):
+        x, _ = next((f, t) for f, t in job.inputs.items() if f.kind == enums.FieldKind.STATE)
         noise = 0.3 * torch.finfo(torch.float32).eps * torch.randn_like(job.inputs[x])
         job = job._replace(inputs={**job.inputs, x: job.inputs[x] * (1 + noise)})
         return execution.forward(job)[0], torch.zeros(0)
@@ -236,13 +236,13 @@ def test_rounding_is_no_reason_to_doubt_a_device(monkeypatch, contact, n, offset
 
     monkeypatch.setattr(launch, "forward", rounded)
     monkeypatch.setattr(launch, "reverse", reverse)
-    model, agreed = cloth.model(), []
+    model, agreed = cloth.build_model(), []
     dt = cloth.stable_step() / 2
-    begin = partial(pressed, model, cloth.rest_state().x, dispatch.TRIED * dt)
-    with patch.object(devices, "elsewhere", lambda tensor: True):
-        rounding = Fused(model, cloth.rest_state(), dispatch.still_drives(model)).rounding
-        for job in dispatch._trials(model, torch.Size(), dispatch.Trial(begin, dt)):
-            agreed.append(self_test.agrees(job, rounding))
+    begin = partial(random_contact_state, model, cloth.rest_state().x, dispatch.SELF_TEST_SUBSTEPS * dt)
+    with patch.object(devices, "is_on_device", lambda tensor: True):
+        rounding = FusedEngine(model, cloth.rest_state(), dispatch.stationary_prescribed(model)).rounding
+        for job in dispatch._self_test_jobs(model, torch.Size(), dispatch.SelfTest(begin, dt)):
+            agreed.append(self_test.matches_cpu(job, rounding))
     assert all(agreed)
 
 
@@ -251,8 +251,8 @@ def test_directions_are_the_references():
     along = tc.Directions({"areal_density.raw": torch.ones(1)})
     known = cloth.sensitivities(start(cloth), opening(TIMES[-1]), TIMES, along=along)[1]
     with elsewhere():
-        found = cloth.sensitivities(start(cloth), opening(TIMES[-1]), TIMES, along=along)[1]
-    torch.testing.assert_close(found.x, known.x, rtol=0, atol=1e-7 * float(known.x.abs().max()))
+        results = cloth.sensitivities(start(cloth), opening(TIMES[-1]), TIMES, along=along)[1]
+    torch.testing.assert_close(results.x, known.x, rtol=0, atol=1e-7 * float(known.x.abs().max()))
 
 
 def test_every_kernel_can_be_written_down():
@@ -265,19 +265,19 @@ def test_every_kernel_can_be_written_down():
 
 
 def test_what_does_not_compile_is_tried_once():
-    launch._kernels.cache_clear()
+    launch._compile_once.cache_clear()
     device = torch.device("cpu")
-    with patch.object(launch, "Kernels", side_effect=Unbuilt("NVRTC: no", "report it")) as tried:
+    with patch.object(launch, "DeviceKernels", side_effect=EngineUnavailable("NVRTC: no", "report it")) as tried:
         for _ in range(2):
-            with pytest.raises(Unbuilt, match="NVRTC: no"):
+            with pytest.raises(EngineUnavailable, match="NVRTC: no"):
                 launch.kernels("text", device)
         assert tried.call_count == 1
-    launch._kernels.cache_clear()
+    launch._compile_once.cache_clear()
 
 
 def test_masks_are_bits():
     masks = (torch.rand(2, 3, 29) < 0.5).to(torch.uint8)[:, 0]
-    bits = launch._packed(masks)
+    bits = launch._pack_bits(masks)
     assert bits.shape == (2, 4)
-    assert torch.equal(launch._unpacked(bits, 29), masks)
-    assert launch._packed(masks[:, :0]).shape == (2, 0)
+    assert torch.equal(launch._unpack_bits(bits, 29), masks)
+    assert launch._pack_bits(masks[:, :0]).shape == (2, 0)

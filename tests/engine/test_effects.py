@@ -2,12 +2,13 @@
 
 import pytest
 import torch
-from helpers.engine_agreement import GRADIENTS, agree, difference, held, layer_transposes, moving, noise, outcome
+from helpers.engine_agreement import GRADIENTS, agree, difference, layer_transposes, moving, moving_hand, noise, outcome
 
 import torchcloth as tc
 from torchcloth.dynamics import substep
 from torchcloth.engine import fused
-from torchcloth.engine.lowering import Unfused, lower
+from torchcloth.engine.builder import UnsupportedPart
+from torchcloth.engine.lowering import lower
 
 E = tc.effects
 TRIANGLES = 30
@@ -78,7 +79,7 @@ def test_alone(name):
 
 def test_standard_in_a_hand():
     cloth = sheet(standard(), {"hand": tc.boundaries.Grasp.corner("upper-left")})
-    agree(cloth, {"hand": held(0.01)}, moving(cloth))
+    agree(cloth, {"hand": moving_hand(0.01)}, moving(cloth))
 
 
 @pytest.mark.parametrize("options", [{}, {"weft_ratio": 0.5, "curl_weft": 3.0}])
@@ -86,7 +87,7 @@ def test_creases_where_it_is_bent_far(options):
     cloth = sheet({"crease": E.CreasingBending(1e-4, 30.0, yield_curvature=12.0, **options)})
     state = remembering(moving(cloth))
     with torch.no_grad():
-        after, _ = substep.rollout(cloth.model(), state, 1e-4, {}, 1)
+        after, _ = substep.rollout(cloth.build_model(), state, 1e-4, {}, 1)
     flowed = (after.memory["effects.crease"] != state.memory["effects.crease"]).any(-1).float().mean()
     assert 0.2 < flowed < 0.9
     agree(cloth, {}, state)
@@ -100,7 +101,7 @@ def test_bending_of_a_sheet_that_lies_folded():
     folded = flat * torch.tensor([1.0, 0.1, 1.0]) + 0.02 * flat.flip(-1)  # seen from far off its plane
     folded[:, 1] = torch.where(flat[:, 0] > flat[:, 0].mean(), flat[:, 1], folded[:, 1])
     state = cloth.state(folded + 1e-4 * noise(folded.shape, 9), state.v)
-    stretch = effects["curl"].sheet.see(state.x).stretch
+    stretch = effects["curl"].stencil.fit_surface(state.x).area_ratio
     assert 0 < int((stretch == 0.5).sum()) < len(stretch)
     agree(cloth, {}, state, substeps=20)
 
@@ -135,7 +136,7 @@ def test_viscous_forces_in_stages(stages, air):
     cloth = sheet(
         effects | ({"mass": E.AddedMass(0.1)} if air else {}), {"hand": tc.boundaries.Grasp.corner("upper-left")}
     )
-    agree(cloth, {"hand": held(0.01)}, moving(cloth), stages=stages)
+    agree(cloth, {"hand": moving_hand(0.01)}, moving(cloth), stages=stages)
 
 
 @pytest.mark.parametrize("viscosity", [1.0, 30.0])
@@ -144,8 +145,8 @@ def test_tangents_of_a_step_that_has_stages(viscosity):
     effects = {**standard(), "viscous": E.KelvinVoigt(viscosity), "elastic": E.Bending(1e-5)}
     cloth = sheet(effects, {"hand": tc.boundaries.Grasp.corner("upper-left")})
     state, dt = moving(cloth), cloth.stable_step()
-    motion = {"hand": held(20 * dt)}
-    assert cloth.plan(state, motion, (0.0, 10 * dt), None).model.stages > 1
+    motion = {"hand": moving_hand(20 * dt)}
+    assert cloth.schedule(state, motion, (0.0, 10 * dt), None).model.stages > 1
     assert layer_transposes(cloth, motion, state, 10, dt) < GRADIENTS
 
 
@@ -153,27 +154,27 @@ def test_an_effect_of_ones_own_that_is_viscous_in_stages_is_for_the_reference():
     class Thicker(E.KelvinVoigt):
         pass
 
-    own, known = sheet({"it": Thicker(5.0)}), sheet({"it": E.KelvinVoigt(5.0)})
-    assert "'it' (Thicker), which is viscous in stages" in own.engine_in_use
+    custom, known = sheet({"it": Thicker(5.0)}), sheet({"it": E.KelvinVoigt(5.0)})
+    assert "'it' (Thicker), which is viscous in stages" in custom.engine_in_use
     state = moving(known)
     with torch.no_grad():
-        one, other = (cloth(state, times=[0.0, 0.01]).x[-1] - state.x for cloth in (own, known))
+        one, other = (cloth(state, times=[0.0, 0.01]).x[-1] - state.x for cloth in (custom, known))
     assert difference(one, other) < 1e-10
     assert known.engine_in_use == "fused"
 
 
 def test_no_air_that_moves_along_changes_nothing_bitwise():
     state = moving(sheet({}))
-    with_none, _ = fused.rollout(sheet({"air": E.AddedMass(0.0)}).model(), state, 1e-4, {}, 50)
-    without, _ = fused.rollout(sheet({}).model(), state, 1e-4, {}, 50)
+    with_none, _ = fused.rollout(sheet({"air": E.AddedMass(0.0)}).build_model(), state, 1e-4, {}, 50)
+    without, _ = fused.rollout(sheet({}).build_model(), state, 1e-4, {}, 50)
     assert torch.equal(with_none.x, without.x)
     assert torch.equal(with_none.v, without.v)
 
 
 def test_memory_that_nobody_owns():
     cloth = sheet({"friction": E.BendingFriction()})
-    with pytest.raises(Unfused, match="friction"):
-        fused.rollout(sheet({}).model(), moving(cloth), 1e-4, {}, 1)
+    with pytest.raises(UnsupportedPart, match="friction"):
+        fused.rollout(sheet({}).build_model(), moving(cloth), 1e-4, {}, 1)
 
 
 def test_friction_that_hardly_moves():
@@ -189,8 +190,8 @@ def test_still_and_flat_has_finite_gradients():
     effects = {"friction": E.BendingFriction(), "shear": E.ShearFriction(), "crease": E.CreasingBending(1e-4)}
     effects |= {"air": E.AirDrag(1.2, tangential=0.1), "saturating": E.SaturatingBending(), "mass": E.AddedMass()}
     cloth = sheet(effects)
-    found = outcome(fused.rollout, cloth, {}, cloth.rest_state(), 3, 1e-4)
-    assert all(bool(torch.isfinite(grad).all()) for grad in found.gradients.values() if grad is not None)
+    results = outcome(fused.rollout, cloth, {}, cloth.rest_state(), 3, 1e-4)
+    assert all(bool(torch.isfinite(grad).all()) for grad in results.gradients.values() if grad is not None)
 
 
 @pytest.mark.parametrize("name", ["bending friction", "standard"])
@@ -204,27 +205,27 @@ def test_float32_gradients_over_a_thousand_steps(name):
     exact = outcome(substep.rollout, cloth, {}, state, 1000, 5e-5)
     torch.set_default_dtype(torch.float32)
     rough = made()
-    found = outcome(fused.rollout, rough, {}, state.map(torch.Tensor.float), 1000, 5e-5)
+    results = outcome(fused.rollout, rough, {}, state.map(torch.Tensor.float), 1000, 5e-5)
     for key, want in exact.gradients.items():
         if want is not None:
-            got = found.gradients[key].double()
+            got = results.gradients[key].double()
             assert float((got - want).norm() / want.norm()) < 1e-3, key
             assert float(torch.cosine_similarity(got.flatten(), want.double().flatten(), 0)) > 0.9999, key
 
 
 def test_an_effect_of_ones_own_is_not_taken_for_the_built_in():
     class Heavier(E.Gravity):
-        def force(self, c, now):
-            return 2 * super().force(c, now)
+        def force(self, c, inputs):
+            return 2 * super().force(c, inputs)
 
     cloth = sheet({"g": Heavier()})
-    with pytest.raises(Unfused, match="'g' \\(Heavier\\)"):
-        lower(cloth.model(), moving(cloth), {})
+    with pytest.raises(UnsupportedPart, match="'g' \\(Heavier\\)"):
+        lower(cloth.build_model(), moving(cloth), {})
 
 
 def test_settling():
     cloth = sheet(standard(), {"hand": tc.boundaries.Grasp.corner("upper-left")})
-    model = cloth.model()
+    model = cloth.build_model()
     settling = E.MassDamping(30.0)
     model = model._replace(effects={**model.effects, "settling": (settling, settling.coefficients().detach())})
     state = moving(cloth)

@@ -14,7 +14,7 @@ UNEVEN = (0.0, 0.003, 0.0035, 0.011, END)  # substeps of another length in each 
 
 
 def one_by_one(monkeypatch):
-    monkeypatch.setattr("torchcloth.engine.fused.Fused.is_plain", lambda *_: False)
+    monkeypatch.setattr("torchcloth.engine.fused.FusedEngine.is_plain", lambda *_: False)
 
 
 def slipping():
@@ -47,11 +47,15 @@ def test_frames_together_are_frames_one_by_one(make, batch, monkeypatch):
 def test_long_simulations_are_cut_into_calls(monkeypatch):
     cloth, calls = sheet("fused"), []
     forward = execution.forward
-    monkeypatch.setattr(execution, "forward", lambda job, every=0: calls.append(job.ends) or forward(job, every))
+    monkeypatch.setattr(
+        execution,
+        "forward",
+        lambda job, record_interval=0: calls.append(job.frame_ends) or forward(job, record_interval),
+    )
     with torch.no_grad():
         whole = cloth(start(cloth), opening(END), UNEVEN)
         assert len(calls) == 1
-        monkeypatch.setattr(rollout, "AT_ONCE", 2 * calls[0][0] * rollout.FEW)
+        monkeypatch.setattr(rollout, "MAX_VERTEX_SUBSTEPS_PER_CALL", 2 * calls[0][0] * rollout.MIN_COUNTED_VERTICES)
         cut = cloth(start(cloth), opening(END), UNEVEN)
     assert 1 < len(calls[1:]) < len(UNEVEN)
     assert torch.equal(whole.x, cut.x)
@@ -73,7 +77,7 @@ def test_who_wants_gradients_gets_them_and_the_same_frames(wanted):
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_nobody_drives_it(dtype, monkeypatch):
+def test_nobody_prescribed_it(dtype, monkeypatch):
     cloth = sheet("fused", boundaries={}).to(dtype)
     with torch.no_grad():
         together = cloth(start(cloth), times=UNEVEN)
@@ -92,12 +96,12 @@ def test_who_keeps_the_last_state_keeps_no_other_frames():
 
 def test_a_cloth_that_is_lost_is_told_alike(monkeypatch):
     cloth = sheet("fused", material=tc.materials.AEP(1e5, 0.3))
-    torn, told = start(cloth), []
+    torn, messages = start(cloth), []
     torn = torn._replace(v=torn.v * 1e155)  # its square overflows
     for apart in (False, True):
         if apart:
             one_by_one(monkeypatch)
         with torch.no_grad(), pytest.raises(SimulationDiverged) as error:
             cloth(torn, opening(END), UNEVEN)
-        told.append(str(error.value))
-    assert told[0] == told[1]
+        messages.append(str(error.value))
+    assert messages[0] == messages[1]

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from torchcloth.engine import building, library
-from torchcloth.engine.building import Unbuilt
+from torchcloth.engine.building import EngineUnavailable
 
 USE = """
 import torch, torchcloth as tc
@@ -157,7 +157,7 @@ def test_where_home_cannot_be_written_to(small, monkeypatch, tmp_path):
     made = building.build()
     assert made.parent.parent == tmp_path / "tmp"
     monkeypatch.setattr(building.tempfile, "gettempdir", lambda: str(tmp_path / "taken"))
-    with pytest.raises(Unbuilt, match="can be written to") as caught:
+    with pytest.raises(EngineUnavailable, match="can be written to") as caught:
         building.build()
     assert "TORCHCLOTH_CACHE" in caught.value.remedy
 
@@ -167,11 +167,11 @@ def test_somebody_elses_library_in_the_temporary_folder_is_not_loaded(small, mon
     monkeypatch.delenv("TORCHCLOTH_CACHE")
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     monkeypatch.setattr(building.tempfile, "gettempdir", lambda: str(tmp_path / "tmp"))
-    folder = building.folders()[-1]
+    folder = building.cache_folders()[-1]
     folder.mkdir(parents=True)
     (folder / building.file_name()).write_text("bad")
     somebody = os.getuid() + 1
-    monkeypatch.setattr(building, "folders", lambda: [folder])  # named by the number of whom it belongs to
+    monkeypatch.setattr(building, "cache_folders", lambda: [folder])  # named by the number of whom it belongs to
     assert building.cached() is not None
     monkeypatch.setattr(building.os, "getuid", lambda: somebody)
     assert building.cached() is None

@@ -5,7 +5,8 @@ import torch
 from helpers.engine_agreement import agree, moving, noise
 
 import torchcloth as tc
-from torchcloth.engine.lowering import Unfused, lower
+from torchcloth.engine.builder import UnsupportedPart
+from torchcloth.engine.lowering import lower
 
 REACH = 0.04  # strain beyond which the weave no longer stiffens
 
@@ -50,7 +51,7 @@ def test_stiffening():
 def test_orthotropic_in_all_its_branches():
     cloth = sheet(orthotropic())
     state = moving(cloth, strain=0.03)
-    s = tc.dynamics.surface(cloth.model().geometry, state.x, state.v)
+    s = tc.dynamics.surface(cloth.build_model().geometry, state.x, state.v)
     strain = torch.cat([s.f1, s.f2]).norm(dim=-1) - 1
     parts = (strain < 0, (strain > 0) & (strain < REACH), strain > REACH)
     assert all(int(part.sum()) > 5 for part in parts)
@@ -65,7 +66,7 @@ def test_sets_and_grown(law, grown):
     cloth = sheet(material, growth() if grown else None)
     state = with_set(moving(cloth, strain=0.1))
     with torch.no_grad():
-        after, _ = tc.dynamics.rollout(cloth.model(), state, 1e-4, {}, 1)
+        after, _ = tc.dynamics.rollout(cloth.build_model(), state, 1e-4, {}, 1)
     flowed = (after.memory["material"] != state.memory["material"]).any(-1).float().mean()
     assert 0.2 < flowed < 0.9
     agree(cloth, {}, state)
@@ -94,5 +95,5 @@ def test_a_law_of_ones_own_is_not_taken_for_the_built_in():
 
     for material in (Own(6e4), tc.materials.AEP(6e4, plastic=OwnYield(0.1))):
         cloth = sheet(material)
-        with pytest.raises(Unfused, match="Own"):
-            lower(cloth.model(), moving(cloth), {})
+        with pytest.raises(UnsupportedPart, match="Own"):
+            lower(cloth.build_model(), moving(cloth), {})

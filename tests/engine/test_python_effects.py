@@ -1,4 +1,4 @@
-"""A user's effects and materials in Python, beside the engine: exact values, gradients in both modes, memory."""
+"""A user's effects and materials in Python, together with the engine: exact values, gradients in both modes, memory."""
 
 import pytest
 import torch
@@ -26,8 +26,8 @@ class Pull(AbstractEffect):
     def coefficients(self):
         return self.strength.field
 
-    def force(self, c, now):
-        return c * torch.stack([now.v[..., 1], torch.sin(now.x[..., 2]), -now.v[..., 0]], dim=-1)
+    def force(self, c, inputs):
+        return c * torch.stack([inputs.v[..., 1], torch.sin(inputs.x[..., 2]), -inputs.v[..., 0]], dim=-1)
 
 
 class Blow(Pull):
@@ -35,8 +35,8 @@ class Blow(Pull):
 
     acts_on = "triangles"
 
-    def force(self, c, now):
-        return c * now.surface.n * now.surface.J
+    def force(self, c, inputs):
+        return c * inputs.surface.n * inputs.surface.J
 
 
 class Fading(Pull):
@@ -45,11 +45,11 @@ class Fading(Pull):
     def initial_memory(self, x):
         return torch.zeros_like(x)
 
-    def update_memory(self, c, now):
-        return now.memory + now.dt * (now.v - 10 * now.memory)
+    def update_memory(self, c, inputs):
+        return inputs.memory + inputs.dt * (inputs.v - 10 * inputs.memory)
 
-    def force(self, c, now):
-        return -100 * c * now.memory
+    def force(self, c, inputs):
+        return -100 * c * inputs.memory
 
 
 class Ballast(Pull):
@@ -126,7 +126,7 @@ def test_values_and_gradients_equal_the_reference(part, options):
 @pytest.mark.parametrize("part", [Fading, "both"])
 def test_forward_mode(part):
     """One direction by forward_ad, and several by ``sensitivities``."""
-    found = []
+    results = []
     for engine in ("fused", "reference"):
         cloth = cloth_with(engine, part)
         state = start(cloth)
@@ -140,8 +140,8 @@ def test_forward_mode(part):
         along = Directions({"effects.bending.stiffness.raw": torch.tensor([0.0, 1.0])}, moved)
         _, many = cloth.sensitivities(state, opening(END), TIMES, along=along)
         close(many.x[0], one, 1e-9, "the same direction")
-        found.append((one, many.x, many.wrench["left"]))
-    for a, b in zip(*found, strict=True):
+        results.append((one, many.x, many.wrench["left"]))
+    for a, b in zip(*results, strict=True):
         close(a, b, 1e-8, "tangent")
 
 
@@ -168,7 +168,7 @@ def test_settling_and_a_grip_effect():
 def test_memory_is_bounded_by_checkpoints(monkeypatch):
     """Tensors that the graph keeps: about one state for every 48 substeps instead of all of each."""
 
-    def kept(checkpoint):
+    def saved_bytes(checkpoint):
         cloth = cloth_with("fused", Pull)
         total = 0
 
@@ -182,21 +182,21 @@ def test_memory_is_bounded_by_checkpoints(monkeypatch):
             cloth(state._replace(x=state.x.requires_grad_()), opening(0.1), (0.0, 0.1), checkpoint=checkpoint)
         return total
 
-    assert kept(True) < kept(False) / 20
+    assert saved_bytes(True) < saved_bytes(False) / 20
 
 
 class Clumsy(Pull):
     """One row for all."""
 
-    def force(self, c, now):
-        return c * now.v.mean(-2, keepdim=True)
+    def force(self, c, inputs):
+        return c * inputs.v.mean(-2, keepdim=True)
 
 
 class Misplaced(Blow):
     """Rows of the vertices where those of triangles are due."""
 
-    def force(self, c, now):
-        return c * now.v
+    def force(self, c, inputs):
+        return c * inputs.v
 
 
 @pytest.mark.parametrize("engine", ["reference", "auto"])
@@ -232,29 +232,29 @@ class Even(Pull):
 
     acts_on = "triangles"
 
-    def force(self, c, now):
-        return c * now.surface.area / now.surface.area.mean() * torch.tensor([1.0, 0.0, 0.0]).to(now.x)
+    def force(self, c, inputs):
+        return c * inputs.surface.area / inputs.surface.area.mean() * torch.tensor([1.0, 0.0, 0.0]).to(inputs.x)
 
 
 def test_a_force_on_triangles_may_be_that_of_all_scenes():
-    found = []
+    results = []
     for engine in ("reference", "fused"):
         cloth = sheet(effects={"even": Even()}, boundaries={})
         cloth.engine = engine
         state = cloth.state(start(cloth).x.expand(2, -1, -1).clone())
-        found.append(cloth(state, times=(0.0, 0.01)).x)
-    close(found[1], found[0], 1e-10, "positions")
+        results.append(cloth(state, times=(0.0, 0.01)).x)
+    close(results[1], results[0], 1e-10, "positions")
 
 
 class Mixing(Pull):
-    """By a plain matrix, whose axes nobody has told."""
+    """By a plain matrix, whose axes nobody has messages."""
 
     def __init__(self, strength=1e-3):
         super().__init__(strength)
         self.matrix = torch.nn.Parameter(torch.eye(3))
 
-    def force(self, c, now):
-        return 1e-3 * now.v @ self.matrix
+    def force(self, c, inputs):
+        return 1e-3 * inputs.v @ self.matrix
 
 
 class Listed(Pull):
@@ -263,8 +263,8 @@ class Listed(Pull):
     def coefficients(self):
         return [self.strength.value[..., None, None] * torch.ones(1, 1)]
 
-    def force(self, c, now):
-        return super().force(c[0], now)
+    def force(self, c, inputs):
+        return super().force(c[0], inputs)
 
 
 def test_a_plain_matrix_has_slopes_of_one_scene_and_is_refused_of_several():

@@ -36,13 +36,13 @@ def parts(out):
 
 
 def both(settle=0.0, batch=(), times=(0.0, 0.4 * END, END), count=3):
-    found = []
+    results = []
     for engine in ("fused", "reference"):
         cloth = sheet(engine)
         state, motion = start(cloth, batch), opening(END)
         along = directions(cloth, state, motion, count)
-        found.append(cloth.sensitivities(state, motion, times, along=along, settle=settle))
-    return found
+        results.append(cloth.sensitivities(state, motion, times, along=along, settle=settle))
+    return results
 
 
 @pytest.mark.parametrize("case", [{}, {"settle": 0.01}, {"batch": (2,)}, {"count": 11, "times": (0.0, 0.003)}], ids=str)
@@ -57,14 +57,14 @@ def test_equal_the_reference(case):
 
 def test_cloth_that_sets_while_it_settles_and_hands_are_moved():
     """It settles in pieces, as what has set shortens the step."""
-    found = []
+    results = []
     for engine in ("fused", "reference"):
         material = tc.materials.AEP(1e5, 0.3, plastic=tc.materials.NormYield(1e-3))
         cloth = sheet(engine, material=material)
         state, motion = start(cloth), opening(END)
         moves = directions(cloth, state, motion).motion
-        found.append(cloth.sensitivities(state, motion, (0.0, END), along=Directions(motion=moves), settle=0.2))
-    (value, moved), (expected, slopes) = found
+        results.append(cloth.sensitivities(state, motion, (0.0, END), along=Directions(motion=moves), settle=0.2))
+    (value, moved), (expected, slopes) = results
     for name in parts(value):
         close(parts(value)[name], parts(expected)[name], 1e-10, name)
         close(parts(moved)[name], parts(slopes)[name], 1e-7, f"tangent of {name}")
@@ -109,26 +109,26 @@ def test_directions_that_leave_the_parameters_alone():
 
 def test_fields_and_boundary_free_cloth():
     """A field per triangle; no motion at all."""
-    found = []
+    results = []
     for engine in ("fused", "reference"):
         field = torch.linspace(0.9e5, 1.1e5, 32)
         cloth = sheet(engine, material=tc.materials.AEP(field, 0.3), boundaries={})
         raw = torch.randn(2, 32, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
         along = Directions({"material.youngs_modulus.raw": raw})
-        found.append(cloth.sensitivities(start(cloth), None, (0.0, 0.01), along=along)[1].x)
-    close(*found, 1e-8, "tangent")
-    assert float(found[0][:, 1].abs().max()) > 0
+        results.append(cloth.sensitivities(start(cloth), None, (0.0, 0.01), along=along)[1].x)
+    close(*results, 1e-8, "tangent")
+    assert float(results[0][:, 1].abs().max()) > 0
 
 
 def test_one_hand_of_two():
     """The other's poses stay as they are."""
-    found = []
+    results = []
     for engine in ("fused", "reference"):
         cloth = sheet(engine)
         pose = directions(cloth, start(cloth), opening(END)).motion["right"]
         along = Directions(motion={"right": pose})
-        found.append(cloth.sensitivities(start(cloth), opening(END), (0.0, END), along=along)[1].x)
-    close(*found, 1e-8, "tangent")
+        results.append(cloth.sensitivities(start(cloth), opening(END), (0.0, END), along=along)[1].x)
+    close(*results, 1e-8, "tangent")
 
 
 @pytest.mark.parametrize("engine", ["auto", "reference"])

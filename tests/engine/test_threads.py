@@ -7,7 +7,7 @@ import sys
 
 import pytest
 import torch
-from helpers.engine_agreement import agree, held, moving
+from helpers.engine_agreement import agree, moving, moving_hand
 from helpers.engine_cloths import opening, sheet, start
 
 import torchcloth as tc
@@ -37,12 +37,12 @@ def threads():
 
 def all_alike(threads, results):
     """Twice with one thread and twice with two."""
-    found = []
+    results = []
     for count in (1, 1, 2, 2):
         threads(count)
-        found.append(results())
-    for other in found[1:]:
-        assert all(torch.equal(a, b) for a, b in zip(found[0], other, strict=True))
+        results.append(results())
+    for other in results[1:]:
+        assert all(torch.equal(a, b) for a, b in zip(results[0], other, strict=True))
 
 
 def test_values_and_gradients(cloth, threads):
@@ -74,7 +74,7 @@ def test_tangents(cloth, threads, count):
 def test_a_team_agrees_with_the_reference():
     """With contact: test_contact.py."""
     cloth = sheet(n=9)
-    agree(cloth, {"left": held(0.01), "right": held(0.01)}, moving(cloth))
+    agree(cloth, {"left": moving_hand(0.01), "right": moving_hand(0.01)}, moving(cloth))
 
 
 @pytest.mark.usefixtures("team")
@@ -110,9 +110,9 @@ def test_helpers_stay_for_the_next_call_and_a_fork_does_without_them():
 
 HIRING = """
 import os, torch, torchcloth as tc
-from torchcloth.engine import running
+from torchcloth.engine import execution
 torch.set_num_threads(3)
-running.WORTH = 1e-9
+execution.MIN_OPS_PER_THREAD = 1e-9
 mesh = tc.meshes.rectangle(0.2, 0.2, resolution=(9, 9))
 cloth = tc.Cloth(mesh, tc.materials.AEP(1e5), 0.2, {"gravity": tc.effects.Gravity()}, contact=None, engine="fused")
 for end, dt in ((2e-5, 1e-5), (0.01, 1e-4)):  # too short for a second thread, and not
@@ -148,12 +148,12 @@ def _all(cloth, state, motion) -> list[torch.Tensor]:
 def test_threads_change_what_a_scene_does_by_rounding_only(contact, monkeypatch):
     cloth = sheet(n=9, contact=contact)
     state, motion = start(cloth), opening(0.03)
-    found = []
+    results = []
     for threads in (1, 2):
-        monkeypatch.setattr(execution, "WORTH", 1e-9)
+        monkeypatch.setattr(execution, "MIN_OPS_PER_THREAD", 1e-9)
         torch.set_num_threads(threads)
-        found.append(_all(cloth, state, motion)[:3])  # positions, their tangents, gradient by positions
+        results.append(_all(cloth, state, motion)[:3])  # positions, their tangents, gradient by positions
     torch.set_num_threads(1)
-    assert not all(torch.equal(a, b) for a, b in zip(*found, strict=True))  # sums have another order
-    for a, b in zip(*found, strict=True):
+    assert not all(torch.equal(a, b) for a, b in zip(*results, strict=True))  # sums have another order
+    for a, b in zip(*results, strict=True):
         assert float((a - b).norm()) <= 1e-8 * float(a.norm())

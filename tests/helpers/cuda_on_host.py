@@ -19,7 +19,7 @@ import torch
 from torchcloth.boundaries.motion import sample_trajectory
 from torchcloth.engine import building, devices, execution
 from torchcloth.engine.cuda import launch as runs
-from torchcloth.engine.fused import Fused
+from torchcloth.engine.fused import FusedEngine
 
 HOST = """
 #include <cmath>
@@ -123,7 +123,7 @@ def stand_in(threads=1, reverse=False):
     """Programs for the CPU are compiled for it."""
     with (
         patch.object(runs, "kernels", lambda text, device: Host(text, threads, reverse)),
-        patch.object(runs, "_KNOWN", WeakKeyDictionary()),
+        patch.object(runs, "_device_programs", WeakKeyDictionary()),
     ):
         yield
 
@@ -136,28 +136,30 @@ def agrees(cloth, motion, state, substeps=60, dt=1e-4, stages=0, marks=(1e-11, 1
 
     Compilers take a while: only where there is a kernel that was not looked at yet.
     """
-    model = cloth.model()._replace(stages=stages)
-    drives = {name: sample_trajectory(t, torch.arange(substeps + 1, dtype=torch.float64) * dt) for name, t in motion.items()}
-    with patch.object(devices, "elsewhere", lambda tensor: True):
-        fused = Fused(model, state, drives)
-    used = {str(given[0]) if name == "call" else name for name, given in fused.low.program.written}
+    model = cloth.build_model()._replace(stages=stages)
+    prescribed = {
+        name: sample_trajectory(t, torch.arange(substeps + 1, dtype=torch.float64) * dt) for name, t in motion.items()
+    }
+    with patch.object(devices, "is_on_device", lambda tensor: True):
+        fused = FusedEngine(model, state, prescribed)
+    used = {str(given[0]) if name == "kernel" else name for name, given in fused.builder.program.recorded_calls}
     if used <= CHECKED:
         return
     CHECKED.update(used)
-    job = fused.job(state, torch.full((substeps,), dt, dtype=torch.float64), drives)
+    job = fused.job(state, torch.full((substeps,), dt, dtype=torch.float64), prescribed)
     job = job._replace(inputs={f: t.detach().contiguous() for f, t in job.inputs.items()})
     ends = (substeps // 3, substeps)
     if model.grid is not None:
         ends = (substeps,)  # what goes on in contact is no frame
-    known, _ = execution.forward(job._replace(ends=ends))
+    known, _ = execution.forward(job._replace(frame_ends=ends))
     generator = torch.Generator().manual_seed(0)
     seeds = {f: torch.randn(job.scenes, f.rows, f.comps, generator=generator, dtype=job.like.dtype) for f in known}
     before = execution.reverse(job, execution.forward(job, 1)[1], 1, seeds, set(job.inputs))
     device = "cuda" if torch.cuda.is_available() else "cpu"
     with stand_in() if device == "cpu" else nullcontext():
         there = job._replace(inputs={f: t.to(device) for f, t in job.inputs.items()})
-        found, masks = runs.forward(there._replace(ends=ends))
+        results, masks = runs.forward(there._replace(frame_ends=ends))
         after = runs.reverse(there, masks, {f: t.to(device) for f, t in seeds.items()}, set(job.inputs))
-    for one, other, mark in ((known, found, marks[0]), (before, after, marks[1])):
+    for one, other, mark in ((known, results, marks[0]), (before, after, marks[1])):
         for f, t in one.items():
             torch.testing.assert_close(other[f].cpu(), t, rtol=0, atol=mark * float(t.abs().max()) + 1e-300, msg=str(f))

@@ -22,7 +22,7 @@ from torchcloth.boundaries import PrescribedMotion
 from torchcloth.boundaries.motion import sample_trajectory
 from torchcloth.dynamics import substep
 from torchcloth.engine import cuda_graphs, execution, fused
-from torchcloth.simulation.rollout import CHUNK
+from torchcloth.simulation.rollout import SUBSTEPS_PER_CHECKPOINT
 from torchcloth.types import ClothState, Trajectory
 
 VALUES, GRADIENTS = 1e-10, 1e-8  # relative, in float64
@@ -47,25 +47,25 @@ def agree(
     """Demand agreement; the largest differences by name are returned for reports."""
     reference = outcome(in_chunks, cloth, motion, state, substeps, dt, stages)
     engine = outcome(fused.rollout, cloth, motion, state, substeps, dt, stages)
-    found = {name: difference(engine.values[name], value) for name, value in reference.values.items()}
-    worse = {name: value for name, value in found.items() if not value <= marks[0]}
+    results = {name: difference(engine.values[name], value) for name, value in reference.values.items()}
+    worse = {name: value for name, value in results.items() if not value <= marks[0]}
     assert set(engine.values) == set(reference.values)
     assert not worse, worse
     for name, value in reference.gradients.items():
         other = engine.gradients[name]
         assert (value is None) == (other is None), f"only one engine has a gradient of {name}"
         if value is not None and other is not None:
-            found[f"d/d {name}"] = difference(other, value)
-    worse = {name: value for name, value in found.items() if not value <= marks[1]}
+            results[f"d/d {name}"] = difference(other, value)
+    worse = {name: value for name, value in results.items() if not value <= marks[1]}
     assert not worse, worse
     runs_on_any_device(cloth, motion, state, dt, stages)
     agrees(cloth, motion, state, dt=dt, stages=stages)
-    found["tangents"] = tangents_transpose(cloth, motion, state, substeps, dt, stages)
-    assert found["tangents"] <= marks[1], found["tangents"]
+    results["tangents"] = tangents_transpose(cloth, motion, state, substeps, dt, stages)
+    assert results["tangents"] <= marks[1], results["tangents"]
     if not stages:
-        found["layer"] = layer_transposes(cloth, motion, state, substeps, dt)
-        assert found["layer"] <= marks[1], found["layer"]
-    return found
+        results["layer"] = layer_transposes(cloth, motion, state, substeps, dt)
+        assert results["layer"] <= marks[1], results["layer"]
+    return results
 
 
 def runs_on_any_device(
@@ -76,19 +76,19 @@ def runs_on_any_device(
     So nothing waits for a number; and nothing is made elsewhere and brought there: it can be captured as a CUDA graph.
     Where layers meet none is: here none do.
     """
-    drives = {
+    prescribed = {
         name: PrescribedMotion(d.increment.to("meta"), d.pose.to("meta"), d.closed)
-        for name, d in drives_of(motion, 2, dt, {name: t.pose for name, t in motion.items()}).items()
+        for name, d in prescribed_of(motion, 2, dt, {name: t.pose for name, t in motion.items()}).items()
     }
-    closed = {name: d.closed[0] for name, d in drives.items()}
-    model = deepcopy(cloth).to("meta").model()._replace(stages=stages)
+    closed = {name: d.closed[0] for name, d in prescribed.items()}
+    model = deepcopy(cloth).to("meta").build_model()._replace(stages=stages)
     leaf = state.map(lambda t: t.to("meta").requires_grad_())
-    lost = torch.zeros_like(leaf.x, requires_grad=False) if state.x.dtype == torch.float32 else None
-    moving = cuda_graphs.Moving.of(leaf, lost, dt, drives, 0, 2)
-    graphs = cuda_graphs.Graphs(model, 2, watched)
-    unit = cuda_graphs.Unit(graphs.own, moving, closed, 2, watched)
-    unit.get_ready(moving, graphs.given, graphs.leaves)
-    end = unit(moving, graphs.given)
+    compensation = torch.zeros_like(leaf.x, requires_grad=False) if state.x.dtype == torch.float32 else None
+    moving = cuda_graphs.GraphInputs.of(leaf, compensation, dt, prescribed, 0, 2)
+    graphs = cuda_graphs.GraphedRollout(model, 2, watched)
+    unit = cuda_graphs.GraphedSegment(graphs.own_model, moving, closed, 2, watched)
+    unit.prepare(moving, graphs.parameters, graphs.leaves)
+    end = unit(moving, graphs.parameters)
     (end.state.x.sum() + sum(value.sum() for value in end.impulses.values())).backward()
     assert leaf.x.grad is not None
     assert leaf.x.grad.is_meta
@@ -136,12 +136,14 @@ def layer_transposes(
     return float(((forward - reverse.sum(0)).abs() / (reverse.abs().sum(0) + 1e-12)).max())
 
 
-def in_chunks(model, state, dt, drives, substeps):
+def in_chunks(model, state, dt, prescribed, substeps):
     """``functional.rollout`` as ``Cloth`` calls it: near layers are searched again at the start of each call."""
     total = {}
-    for first in range(0, substeps, CHUNK):
-        state, found = substep.rollout(model, state, dt, drives, min(CHUNK, substeps - first), first)
-        total = {name: total[name] + value if name in total else value for name, value in found.items()}
+    for first in range(0, substeps, SUBSTEPS_PER_CHECKPOINT):
+        state, results = substep.rollout(
+            model, state, dt, prescribed, min(SUBSTEPS_PER_CHECKPOINT, substeps - first), first
+        )
+        total = {name: total[name] + value if name in total else value for name, value in results.items()}
     return state, total
 
 
@@ -150,8 +152,8 @@ def outcome(rollout, cloth, motion, state: ClothState, substeps: int, dt: float,
     cloth.zero_grad()
     leaf = state.map(lambda t: t.clone().requires_grad_())
     poses = {name: trajectory.pose.clone().requires_grad_() for name, trajectory in motion.items()}
-    model = cloth.model()._replace(stages=stages)
-    end, impulses = rollout(model, leaf, dt, drives_of(motion, substeps, dt, poses), substeps)
+    model = cloth.build_model()._replace(stages=stages)
+    end, impulses = rollout(model, leaf, dt, prescribed_of(motion, substeps, dt, poses), substeps)
     values = {
         "displacement": end.x - state.x,
         "v": end.v,
@@ -168,10 +170,12 @@ def outcome(rollout, cloth, motion, state: ClothState, substeps: int, dt: float,
     return Outcome({name: value.detach() for name, value in values.items()}, grads)
 
 
-def drives_of(motion: Mapping[str, Trajectory], substeps: int, dt: float, poses: Mapping[str, Tensor]):
+def prescribed_of(motion: Mapping[str, Trajectory], substeps: int, dt: float, poses: Mapping[str, Tensor]):
     """The trajectories on the substeps, with these poses."""
     times = torch.linspace(0, substeps * dt, substeps + 1, dtype=torch.float64)
-    return {name: sample_trajectory(trajectory._replace(pose=poses[name]), times) for name, trajectory in motion.items()}
+    return {
+        name: sample_trajectory(trajectory._replace(pose=poses[name]), times) for name, trajectory in motion.items()
+    }
 
 
 def some_function(values: Mapping[str, Tensor]) -> Tensor:
@@ -199,11 +203,11 @@ def _columns(value: Tensor) -> Tensor:
 def tangents_transpose(cloth, motion, state: ClothState, substeps: int, dt: float, stages: int, directions=9) -> float:
     """Relative error of <seed, J dot> = <J^T seed, dot> of the engine, for random dots of all inputs."""
     with torch.no_grad():
-        drives = drives_of(motion, substeps, dt, {name: t.pose for name, t in motion.items()})
-        engine = fused.Fused(cloth.model()._replace(stages=stages), state, drives)
+        prescribed = prescribed_of(motion, substeps, dt, {name: t.pose for name, t in motion.items()})
+        engine = fused.FusedEngine(cloth.build_model()._replace(stages=stages), state, prescribed)
         assert engine.torch_parts is None, f"not on the engine: {engine.torch_parts.parts}"
-        job = engine.job(state, torch.full((substeps,), dt), drives)
-        varied = {field for field in job.inputs if field != engine.low.dt}  # the step itself is not differentiated
+        job = engine.job(state, torch.full((substeps,), dt), prescribed)
+        varied = {field for field in job.inputs if field != engine.builder.dt}  # the step itself is not differentiated
         results, records = execution.forward(job, 1)
         seeds = {f: scaled(noise(t.shape, k, t.dtype), t) for k, (f, t) in enumerate(results.items())}
         gradients = execution.reverse(job, records, 1, seeds, varied)
@@ -220,7 +224,7 @@ def scaled(seed: Tensor, value: Tensor) -> Tensor:
 
 
 def scaled_dots(field, job, gradient: Tensor, directions: int) -> Tensor:
-    """Random directions that all matter alike: [scenes, directions, rows, comps] over the gradient's size."""
+    """Random directions that all matter equally: [scenes, directions, rows, comps] over the gradient's size."""
     dots = noise((len(gradient), directions, *gradient.shape[1:]), field.id, gradient.dtype)
     if len(job.inputs[field]) == 1:
         dots = dots[:1].expand_as(dots)
@@ -245,7 +249,7 @@ def moving(cloth: tc.Cloth, scenes: tuple[int, ...] = (), strain: float = 0.03, 
     return cloth.state((x @ turn.mT).to(rest), 0.5 * noise(x.shape, seed + 3).to(rest))
 
 
-def held(cloth_time: float, knots: int = 3, scenes: tuple[int, ...] = ()) -> Trajectory:
+def moving_hand(cloth_time: float, knots: int = 3, scenes: tuple[int, ...] = ()) -> Trajectory:
     """A hand that moves and turns."""
     pose = torch.eye(4).repeat(*scenes, knots, 1, 1)
     angle = torch.linspace(0, 0.1, knots)

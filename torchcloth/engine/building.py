@@ -38,12 +38,16 @@ PORTABLE_LEVELS = {
     "aarch64": {"armv8-a": frozenset()},
     "arm64": {"armv8-a": frozenset()},
 }
-CLANG = "-fbracket-depth=16384 -fconstexpr-steps=200000000"  # its limits are lower than a kernel's trace
-SPEED = 420.0  # bytes of kernels that one core compiles in a second, measured with g++ 12
+CLANG_FLAGS = "-fbracket-depth=16384 -fconstexpr-steps=200000000"  # its limits are lower than a kernel's trace
+KERNEL_BYTES_PER_CORE_SECOND = 420.0  # source that one core compiles in a second, measured with g++ 12
 
 
-class Unbuilt(RuntimeError):
-    """There is no library, and why; ``remedy``: what to do."""
+class EngineUnavailable(RuntimeError):
+    """The engine's library cannot be had; the text says why.
+
+    Attributes:
+        remedy: what the user can do about it.
+    """
 
     def __init__(self, reason: str, remedy: str) -> None:
         super().__init__(reason)
@@ -51,7 +55,7 @@ class Unbuilt(RuntimeError):
 
 
 def file_name() -> str:
-    """Of the library for these sources on this processor."""
+    """Return the name of the library for these sources on this processor."""
     return f"engine-{_digest(f'{FLAGS} {platform.machine()} {_processor()}')}.so"
 
 
@@ -61,10 +65,10 @@ def portable_file_name(level: str) -> str:
 
 
 def _digest(target: str) -> str:
-    known = hashlib.sha256(target.encode())
+    digest = hashlib.sha256(target.encode())
     for file in _sources():
-        known.update(file.relative_to(SOURCES).as_posix().encode() + file.read_bytes())
-    return known.hexdigest()[:20]
+        digest.update(file.relative_to(SOURCES).as_posix().encode() + file.read_bytes())
+    return digest.hexdigest()[:20]
 
 
 def portable_levels() -> dict[str, frozenset[str]]:
@@ -81,42 +85,42 @@ def find_portable(folder: Path) -> Path | None:
 
 
 def compiler() -> list[str]:
-    """The command: $CXX, g++ or clang++.
+    """Return the compiler's command: $CXX, g++ or clang++.
 
     Raises:
-        Unbuilt: there is none.
+        EngineUnavailable: there is no compiler.
     """
     for command in (os.environ.get("CXX", ""), "g++", "clang++", "c++"):
         try:
             parts = shlex.split(command)
         except ValueError as error:
-            raise Unbuilt(f"CXX is no command ({error})", "correct it, or leave it out") from None
+            raise EngineUnavailable(f"CXX is no command ({error})", "correct it, or leave it out") from None
         if parts and shutil.which(parts[0]):
             return parts
-    raise Unbuilt("no C++ compiler", "install one (Debian, Ubuntu: apt-get install g++) or name it in CXX")
+    raise EngineUnavailable("no C++ compiler", "install one (Debian, Ubuntu: apt-get install g++) or name it in CXX")
 
 
 def version(command: list[str]) -> str:
-    """First line of what the compiler says of itself."""
+    """Return the first line of the compiler's version."""
     with suppress(OSError):
-        done = subprocess.run([*command, "--version"], capture_output=True, text=True)
-        return (done.stdout or done.stderr).partition("\n")[0]
+        process = subprocess.run([*command, "--version"], capture_output=True, text=True)
+        return (process.stdout or process.stderr).partition("\n")[0]
     return command[0]
 
 
-def folders() -> list[Path]:
-    """Where a library may be kept, best first."""
-    own = os.environ.get("TORCHCLOTH_CACHE")
-    found = [Path(own).expanduser().resolve()] if own else []  # a bare name would be looked for by the loader
-    with suppress(RuntimeError):  # nobody's home
-        found.append(Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "torchcloth")
-    return [*found, Path(tempfile.gettempdir()) / f"torchcloth-{os.getuid() if hasattr(os, 'getuid') else 'cache'}"]
+def cache_folders() -> list[Path]:
+    """Return the folders in which a library may lie, best first."""
+    chosen = os.environ.get("TORCHCLOTH_CACHE")
+    folders = [Path(chosen).expanduser().resolve()] if chosen else []  # the loader would search for a bare name
+    with suppress(RuntimeError):  # the user has no home
+        folders.append(Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "torchcloth")
+    return [*folders, Path(tempfile.gettempdir()) / f"torchcloth-{os.getuid() if hasattr(os, 'getuid') else 'cache'}"]
 
 
 def cached(name: str | None = None) -> Path | None:
-    """A file in the cache, by default the library; None: not there."""
+    """Return a file in the cache, by default the library; None if it is not there."""
     name = file_name() if name is None else name
-    return next((folder / name for folder in folders() if is_safe(folder / name)), None)
+    return next((folder / name for folder in cache_folders() if is_safe(folder / name)), None)
 
 
 def build(level: str | None = None) -> Path:
@@ -126,25 +130,26 @@ def build(level: str | None = None) -> Path:
         level: of a portable library, one of ``portable_levels()``; None: the native library.
 
     Raises:
-        Unbuilt: no compiler, it failed, or there is no folder to write to.
+        EngineUnavailable: no compiler, it failed, or no folder can be written to.
     """
     command = compiler()
     name = file_name() if level is None else portable_file_name(level)
     flags = FLAGS if level is None else FLAGS.replace(NATIVE_FLAG, f"-march={level}")
-    for folder in own_folders():
+    for folder in private_cache_folders():
         with suppress(OSError):
             target = folder / name
-            with _alone(folder):  # another process may be building the same
+            with _build_lock(folder):  # another process may be building the same
                 if not is_safe(target):
                     _compile(command, target, flags.split())
             return target
-    places = ", ".join(str(f) for f in folders())
-    raise Unbuilt(f"no folder for the engine's library can be written to ({places})", "name one in TORCHCLOTH_CACHE")
+    places = ", ".join(str(f) for f in cache_folders())
+    reason = f"no folder for the engine's library can be written to ({places})"
+    raise EngineUnavailable(reason, "name one in TORCHCLOTH_CACHE")
 
 
-def own_folders() -> Iterator[Path]:
-    """Those that are there, or can be made, and are nobody else's; best first."""
-    for folder in folders():
+def private_cache_folders() -> Iterator[Path]:
+    """Yield the cache folders that exist or can be made, and belong to nobody else; best first."""
+    for folder in cache_folders():
         with suppress(OSError):
             folder.mkdir(parents=True, exist_ok=True, mode=0o700)
             if is_safe(folder):
@@ -157,7 +162,7 @@ def _sources() -> list[Path]:
 
 @cache
 def _processor() -> str:
-    """Instructions that the processor knows: what -march=native depends on."""
+    """Instruction sets of the processor, on which -march=native depends."""
     with suppress(OSError):
         for line in Path("/proc/cpuinfo").read_text(encoding="utf-8", errors="replace").splitlines():
             name, _, value = line.partition(":")
@@ -167,18 +172,18 @@ def _processor() -> str:
 
 
 def is_safe(path: Path) -> bool:
-    """Is there, and was not put there by somebody else where everybody can write."""
+    """Return whether a file exists, and nobody else put it into a folder where everybody can write."""
     try:
-        own = not hasattr(os, "getuid") or path.stat().st_uid == os.getuid()
+        is_ours = not hasattr(os, "getuid") or path.stat().st_uid == os.getuid()
     except OSError:
         return False
-    return own or not path.is_relative_to(tempfile.gettempdir())
+    return is_ours or not path.is_relative_to(tempfile.gettempdir())
 
 
 @contextmanager
-def _alone(folder: Path) -> Iterator[None]:
+def _build_lock(folder: Path) -> Iterator[None]:
     with open(folder / "building.lock", "w", encoding="utf-8") as lock:
-        with suppress(ImportError, OSError):  # without locks two processes build twice, and the last one wins
+        with suppress(ImportError, OSError):  # without locks two processes build twice, and the last result stays
             import fcntl
 
             fcntl.flock(lock, fcntl.LOCK_EX)
@@ -188,29 +193,29 @@ def _alone(folder: Path) -> Iterator[None]:
 def _compile(command: list[str], target: Path, flags: list[str]) -> None:
     files = [p for p in _sources() if p.suffix == ".cpp"]
     cores = min(os.cpu_count() or 1, len(files))
-    seconds = sum(p.stat().st_size for p in files if p.parent.name == "kernels") / SPEED / cores
+    seconds = sum(p.stat().st_size for p in files if p.parent.name == "kernels") / KERNEL_BYTES_PER_CORE_SECOND / cores
     print(f"torchcloth: building the engine once with {command[0]}, about {seconds:.0f} s", file=sys.stderr, flush=True)
-    flags = flags + (CLANG.split() if "clang" in version(command) else [])
+    flags = flags + (CLANG_FLAGS.split() if "clang" in version(command) else [])
     with tempfile.TemporaryDirectory(dir=target.parent) as scratch:
-        made = Path(scratch) / "engine.so"
+        library = Path(scratch) / "engine.so"
 
-        def one(pair: tuple[int, Path]) -> str:
+        def compile_one(pair: tuple[int, Path]) -> str:
             out = str(Path(scratch) / f"{pair[0]}.o")
             _run([*command, *flags, "-c", str(pair[1]), "-o", out])
             return out
 
         with ThreadPoolExecutor(cores) as pool:
-            objects = list(pool.map(one, enumerate(files)))
-        _run([*command, "-shared", "-pthread", *objects, "-o", str(made)])
-        os.replace(made, target)
+            objects = list(pool.map(compile_one, enumerate(files)))
+        _run([*command, "-shared", "-pthread", *objects, "-o", str(library)])
+        os.replace(library, target)
 
 
 def _run(command: list[str]) -> None:
-    done = subprocess.run(command, capture_output=True, text=True)
-    if done.returncode:
-        lines = (done.stderr or done.stdout).splitlines()
+    process = subprocess.run(command, capture_output=True, text=True)
+    if process.returncode:
+        lines = (process.stderr or process.stdout).splitlines()
         first = next((line.strip() for line in lines if "error" in line), lines[-1] if lines else "no message")
-        raise Unbuilt(
-            f"{command[0]} failed (exit code {done.returncode}): {first}",
+        raise EngineUnavailable(
+            f"{command[0]} failed (exit code {process.returncode}): {first}",
             "name a compiler for C++20 in CXX (g++ 12 or clang++ 15, or later)",
         )

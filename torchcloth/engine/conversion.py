@@ -1,4 +1,4 @@
-"""Between a cloth's tensors and those of a program: [scenes or 1, rows, components] each."""
+"""Conversion between a cloth's tensors and those of a program, which are [scenes or 1, rows, components]."""
 
 from __future__ import annotations
 
@@ -7,62 +7,74 @@ from collections.abc import Mapping
 import torch
 from torch import Tensor
 
-from ..boundaries import Drive
+from ..boundaries import PrescribedMotion
 from ..dynamics.forces import Impulses
 from ..types import ClothState
+from .builder import SubstepBuilder
 from .fields import Field
-from .lowering import Lowering
 
 
-def named(state: ClothState) -> dict[str, Tensor]:
-    """What a program may carry, by the names of ``Lowering.carried``."""
+def state_tensors(state: ClothState) -> dict[str, Tensor]:
+    """Return all tensors of a state by the names of ``SubstepBuilder.state_fields``."""
     return {"x": state.x, "v": state.v, "d3": state.d3, **state.memory}
 
 
-def state_inputs(low: Lowering, state: ClothState, lost: Tensor | None = None) -> dict[Field, Tensor]:
-    """The state's tensors, by field; ``lost``: see ``functional.stretch``."""
-    values = named(state)
-    found = {carried.now: values[name] for name, carried in low.carried.items()}
-    if low.lost is not None and lost is not None:
-        found[low.lost.now] = lost
-    return found
+def state_inputs(builder: SubstepBuilder, state: ClothState, compensation: Tensor | None = None) -> dict[Field, Tensor]:
+    """Return the state's tensors by field, with the compensation of the positions where there is one."""
+    tensors = state_tensors(state)
+    inputs = {field.now: tensors[name] for name, field in builder.state_fields.items()}
+    if builder.compensation is not None and compensation is not None:
+        inputs[builder.compensation.now] = compensation
+    return inputs
 
 
-def drive_inputs(low: Lowering, drives: Mapping[str, Drive]) -> dict[Field, Tensor]:
-    """The drives' tensors [..., substeps, comps], by field."""
-    found = {}
-    for name, drive in drives.items():
-        increment, pose, closed = low.drives[name]
-        found[increment], found[pose] = drive.increment.flatten(-2), drive.pose.flatten(-2)
-        found[closed] = torch.tensor(drive.closed, dtype=low.program.dtype).unsqueeze(-1)
-    return found
+def prescribed_inputs(builder: SubstepBuilder, prescribed: Mapping[str, PrescribedMotion]) -> dict[Field, Tensor]:
+    """Return the tensors [..., substeps, comps] of prescribed motions by field."""
+    inputs = {}
+    for name, motion in prescribed.items():
+        increment, pose, closed = builder.prescribed[name]
+        inputs[increment], inputs[pose] = motion.increment.flatten(-2), motion.pose.flatten(-2)
+        inputs[closed] = torch.tensor(motion.closed, dtype=builder.program.dtype).unsqueeze(-1)
+    return inputs
 
 
-def flat(low: Lowering, found: Mapping[Field, Tensor], batch: torch.Size, behind: int = 2) -> dict[Field, Tensor]:
-    """Contiguous tensors of the program's precision, where the cloth is.
+def flatten_batch(
+    builder: SubstepBuilder, tensors: Mapping[Field, Tensor], batch: torch.Size, trailing: int = 2
+) -> dict[Field, Tensor]:
+    """Return contiguous tensors of the program's precision, on the cloth's device, with one axis for all scenes.
 
-    ``batch``: the scenes' shape, before the last ``behind`` axes.
+    Args:
+        builder: the program.
+        tensors: by field.
+        batch: shape of the scenes, in front of the last ``trailing`` axes.
+        trailing: axes that stay.
     """
-    out, scenes = {}, batch.numel()
-    for field, t in found.items():
-        own, rest = t.shape[:-behind], t.shape[-behind:]
-        many = own.numel() > 1 or (scenes > 1 and field in _states(low))
-        full = t.expand(*batch, *rest).reshape(-1, *rest) if many else t.reshape(1, *rest)
-        out[field] = full.to(low.device, low.program.dtype).contiguous()
-    return out
+    flat, scenes = {}, batch.numel()
+    states = {field.now for field in builder.state_fields.values()}
+    for field, t in tensors.items():
+        leading, rest = t.shape[:-trailing], t.shape[-trailing:]
+        differs = leading.numel() > 1 or (scenes > 1 and field in states)
+        full = t.expand(*batch, *rest).reshape(-1, *rest) if differs else t.reshape(1, *rest)
+        flat[field] = full.to(builder.device, builder.program.dtype).contiguous()
+    return flat
 
 
-def outcome(
-    low: Lowering, before: ClothState, results: Mapping[Field, Tensor], batch: torch.Size
+def unflatten_results(
+    builder: SubstepBuilder, before: ClothState, results: Mapping[Field, Tensor], batch: torch.Size
 ) -> tuple[ClothState, Tensor | None, Impulses]:
-    """The state after the substeps, what is lost, and the impulses, from [scenes, rows, components]."""
+    """Return the state after the substeps, the compensation, and the impulses.
+
+    Args:
+        builder: the program.
+        before: the state before.
+        results: [scenes, rows, components] by field.
+        batch: shape of the scenes.
+    """
     shaped = {f: t.reshape(*batch, *t.shape[1:]) for f, t in results.items()}
-    after = {name: shaped[carried.after] for name, carried in low.carried.items()}
-    impulses = {name: shaped[f].squeeze(-2) for name, f in low.impulses.items()}
-    lost = None if low.lost is None else shaped[low.lost.after].detach()  # which has no derivative
+    after = {name: shaped[field.after] for name, field in builder.state_fields.items()}
+    impulses = {name: shaped[f].squeeze(-2) for name, f in builder.impulses.items()}
+    compensation = None
+    if builder.compensation is not None:
+        compensation = shaped[builder.compensation.after].detach()  # it has no derivative
     x, v, d3 = after.pop("x"), after.pop("v"), after.pop("d3", before.d3)
-    return ClothState(x, v, d3, before.memory | after), lost, impulses
-
-
-def _states(low: Lowering) -> set[Field]:
-    return {carried.now for carried in low.carried.values()}
+    return ClothState(x, v, d3, before.memory | after), compensation, impulses

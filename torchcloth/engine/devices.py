@@ -1,4 +1,4 @@
-"""A job where its tensors are: on the processor (``running``), or on a CUDA device (``cuda``)."""
+"""A job on the device of its tensors: on the CPU (``execution``), or on a CUDA device (``cuda``)."""
 
 from __future__ import annotations
 
@@ -9,93 +9,94 @@ from torch import Tensor
 
 from ..errors import InvalidInput
 from . import execution
-from .building import Unbuilt
+from .building import EngineUnavailable
 from .cuda import launch, self_test
 from .execution import Job
 from .fields import Field
 from .program import Program
 
 
-def elsewhere(tensor: Tensor) -> bool:
-    """Whether such tensors are not the processor's."""
+def is_on_device(tensor: Tensor) -> bool:
+    """Return whether a tensor is on a CUDA device."""
     return tensor.is_cuda
 
 
-def forward(job: Job, every: int = 0, keep: bool = False) -> tuple[dict[Field, Tensor], Tensor]:
-    """(nexts and sums [scenes, (frames,) rows, comps], records).
+def forward(job: Job, record_interval: int = 0, keep_masks: bool = False) -> tuple[dict[Field, Tensor], Tensor]:
+    """Run the substeps; arguments and results as of ``execution.forward``.
 
-    ``every``: see ``running.forward``. On a device, which goes through all substeps again, records are which triangles
-    met others, where ``keep`` says that there will be a reverse sweep.
+    On a device, where the adjoint repeats all substeps, the records are only the masks of the triangles in contact.
+    ``keep_masks``: a reverse sweep will need them.
     """
-    return launch.forward(job, keep) if elsewhere(job.like) else execution.forward(job, every)
+    return launch.forward(job, keep_masks) if is_on_device(job.like) else execution.forward(job, record_interval)
 
 
 def reverse(
-    job: Job, records: Tensor, every: int, seeds: Mapping[Field, Tensor], wanted: set[Field]
+    job: Job, records: Tensor, record_interval: int, seeds: Mapping[Field, Tensor], wanted: set[Field]
 ) -> dict[Field, Tensor]:
-    """Adjoints [scenes, rows, comps] of the wanted inputs, from those of nexts and sums.
+    """Return the adjoints [scenes, rows, comps] of the wanted inputs, from those of the results (``seeds``).
 
-    ``every``: 0: without records.
+    ``record_interval``: 0: there are no records, and the sweep makes them.
     """
-    if elsewhere(job.like):
+    if is_on_device(job.like):
         return launch.reverse(job, records, seeds, wanted)
-    if every == 0:
-        every = execution.spacing(job)
-        records = execution.forward(job, every)[1]
-    return execution.reverse(job, records.contiguous(), every, seeds, wanted)
+    if record_interval == 0:
+        record_interval = execution.checkpoint_interval(job)
+        records = execution.forward(job, record_interval)[1]
+    return execution.reverse(job, records.contiguous(), record_interval, seeds, wanted)
 
 
-def records_like(program: Program, scenes: int, substeps: int, every: int, like: Tensor) -> Tensor:
-    """The shape and precision of what ``forward`` gives besides results, without numbers."""
-    if elsewhere(like):
-        size = launch.mask_size(launch.on_device(program, like.device).source, substeps)
+def empty_records(program: Program, scenes: int, substeps: int, record_interval: int, like: Tensor) -> Tensor:
+    """Return a tensor with the shape and precision of the records of ``forward``."""
+    if is_on_device(like):
+        size = launch.mask_size(launch.device_program(program, like.device).module, substeps)
         return like.new_empty(scenes, -(-size // 8), dtype=torch.uint8)
-    return like.new_empty(scenes, execution.record_size(program, substeps, every))
+    return like.new_empty(scenes, execution.record_size(program, substeps, record_interval))
 
 
 def prepare(program: Program, device: torch.device) -> bool:
-    """Compile for a device; whether it was tried there.
+    """Compile a program for a device; return whether it passed the self-test there.
 
     Raises:
-        Unbuilt: it cannot be, or it failed when it was tried.
+        EngineUnavailable: it cannot be compiled, or it failed the self-test.
     """
-    there = launch.on_device(program, device)
-    if there.doubt is not None:
-        raise Unbuilt(*there.doubt)
-    return there.tried
+    compiled = launch.device_program(program, device)
+    if compiled.failure is not None:
+        raise EngineUnavailable(*compiled.failure)
+    return compiled.passed_self_test
 
 
-def try_out(jobs: Iterable[Job], rounding: Field | None) -> None:
-    """Compare a device with the processor, on jobs of one program until one agrees; see ``trial.agrees``.
+def run_self_test(jobs: Iterable[Job], rounding: Field | None) -> None:
+    """Compare a device with the CPU on jobs of one program until one agrees; see ``self_test.matches_cpu``.
 
-    A wrong kernel is always wrong; what lies on a kink, where rounding decides, does so in few of them.
+    A wrong kernel is wrong on all jobs. A state on a kink, where rounding decides, is rare.
 
     Raises:
-        Unbuilt: none agrees, or the device fails.
+        EngineUnavailable: no job agrees, or the device fails.
     """
-    doubt = None
+    failure = None
     for job in jobs:
-        there, doubt = launch.on_device(job.program, job.like.device), _doubt(job, rounding)
-        there.tried, there.doubt = doubt is None, doubt
-        if there.tried:
+        compiled = launch.device_program(job.program, job.like.device)
+        failure = _self_test_failure(job, rounding)
+        compiled.passed_self_test, compiled.failure = failure is None, failure
+        if compiled.passed_self_test:
             return
-    if doubt is not None:
-        raise Unbuilt(*doubt)
+    if failure is not None:
+        raise EngineUnavailable(*failure)
 
 
-def _doubt(job: Job, rounding: Field | None) -> tuple[str, str] | None:
-    """What a device does instead, and what to do about it."""
+def _self_test_failure(job: Job, rounding: Field | None) -> tuple[str, str] | None:
+    """What a device does wrong, and what the user can do about it."""
     try:
-        if self_test.agrees(job, rounding):
+        if self_test.matches_cpu(job, rounding):
             return None
     except torch.OutOfMemoryError:
         raise
     except (RuntimeError, InvalidInput) as error:
-        said = str(error).partition("\n")[0]
-        return f"the engine on {_name(job)} fails ({said})", "begin a new process, and please report it"
-    return f"the engine on {_name(job)} is not the CPU's", "please report it"
+        message = str(error).partition("\n")[0]
+        return f"the engine on {_device_name(job)} fails ({message})", "begin a new process, and please report it"
+    return f"the engine on {_device_name(job)} is not the CPU's", "please report it"
 
 
-def _name(job: Job) -> str:
+def _device_name(job: Job) -> str:
     device = job.like.device
     return torch.cuda.get_device_name(device) if device.type == "cuda" else str(device)

@@ -9,140 +9,164 @@ from typing import Literal, NamedTuple, get_args
 
 import torch
 
-from .._utils.torch_modes import transformed
-from ..boundaries import Drive
+from .._utils.torch_modes import under_torch_transform
+from ..boundaries import PrescribedMotion
 from ..dynamics.model import Model
 from ..errors import InvalidInput
 from ..types import ClothState
 from . import devices
+from .builder import UnsupportedPart
 from .execution import Job
-from .fused import Fused
-from .library import Unbuilt, library
-from .lowering import Unfused
+from .fused import FusedEngine
+from .library import EngineUnavailable, library
 
 Setting = Literal["auto", "reference", "fused"]
-TRIALS, TRIED = 3, 16  # of a device: at most so many, of so many substeps
+SELF_TEST_SEEDS = 3  # states on which a device is compared with the CPU, at most
+SELF_TEST_SUBSTEPS = 16
 
 
-class Choice(NamedTuple):
-    """The fused engine, or None for the reference; and the reason in words."""
+class EngineChoice(NamedTuple):
+    """The engine of a call.
 
-    fused: Fused | None
+    Attributes:
+        fused: the fused engine; None: the reference.
+        reason: why, for a user.
+        uses_cuda_graphs: substeps of the reference run as CUDA graphs.
+    """
+
+    fused: FusedEngine | None
     reason: str
-    captured: bool = False  # substeps of the reference, as CUDA graphs
+    uses_cuda_graphs: bool = False
 
     def __str__(self) -> str:
         if self.fused is None:
-            return f"reference{', in CUDA graphs' if self.captured else ''} ({self.reason})"
+            return f"reference{', in CUDA graphs' if self.uses_cuda_graphs else ''} ({self.reason})"
         parts = () if self.fused.torch_parts is None else sorted(self.fused.torch_parts.parts)
         return f"fused, with {', '.join(parts)} in torch" if parts else "fused"
 
 
+class SelfTest(NamedTuple):
+    """Inputs of the one-time self-test that compares a device with the CPU engine.
+
+    Attributes:
+        initial_state: returns a state for a batch shape and a seed.
+        dt: substep [s].
+    """
+
+    initial_state: Callable[[torch.Size, int], ClothState]
+    dt: float
+
+
 def check_setting(setting: str) -> Setting:
-    """One of "auto", "reference", "fused".
+    """Return the setting if it is "auto", "reference" or "fused".
 
     Raises:
-        InvalidInput: anything else.
+        InvalidInput: it is anything else.
     """
     if setting not in get_args(Setting):
         raise InvalidInput("engine", got=repr(setting), expected='"auto", "reference" or "fused"')
     return setting  # type: ignore[return-value]
 
 
-class Trial(NamedTuple):
-    """On what a device is tried."""
-
-    begin: Callable[[torch.Size, int], ClothState]  # scenes, by their batch and a seed
-    dt: float  # s
-
-
-def choose(
+def choose_engine(
     setting: Setting,
     model: Model,
     state: ClothState,
-    drives: Mapping[str, Drive],
-    trial: Trial | None = None,
-) -> Choice:
-    """The engine for one call; warns once per process where only a compiler is missing.
+    prescribed: Mapping[str, PrescribedMotion],
+    self_test: SelfTest | None = None,
+) -> EngineChoice:
+    """Return the engine for one call; warn once per process where only a compiler is missing.
 
-    ``trial``: on what a device is tried that was not yet; None: it is not.
+    Args:
+        setting: "auto", "reference" or "fused".
+        model: the model.
+        state: the initial state.
+        prescribed: motions by boundary.
+        self_test: inputs for a device that was not tested yet; None: it is not tested.
 
     Raises:
-        InvalidInput: ``setting`` is "fused" and it cannot be.
+        InvalidInput: ``setting`` is "fused", and the fused engine cannot run this cloth.
     """
     if setting == "reference":
-        return Choice(None, "as asked for")
+        return EngineChoice(None, "as asked for")
     remedy = 'use engine="auto", which falls back to the reference'
     try:
-        if devices.elsewhere(state.x):
-            return _on_device(model, state, drives, trial)
-        return Choice(_fused(model, state, drives), "")
-    except Unfused as miss:
-        reason = f"{miss} has no kernels"
-    except _Elsewhere as miss:
-        reason = str(miss)
-    except Unbuilt as miss:
-        reason = str(miss)
-        remedy = f'{miss.remedy}, or use engine="auto"'
+        if devices.is_on_device(state.x):
+            return _choose_on_device(model, state, prescribed, self_test)
+        return EngineChoice(_fused_on_cpu(model, state, prescribed), "")
+    except UnsupportedPart as error:
+        reason = f"{error} has no kernels"
+    except _UnsupportedTensors as error:
+        reason = str(error)
+    except EngineUnavailable as error:
+        reason = str(error)
+        remedy = f'{error.remedy}, or use engine="auto"'
         if setting == "auto":
-            _warn(f"{reason}: simulations run on the torch reference, tens of times slower; {miss.remedy}")
+            _warn_once(f"{reason}: simulations run on the torch reference, tens of times slower; {error.remedy}")
     if setting == "fused":
         raise InvalidInput(
             "engine", got='"fused"', expected=f"a cloth that the engine can run: {reason}", remedy=remedy
         )
-    return Choice(None, reason, captured=state.x.is_cuda and not transformed())
+    return EngineChoice(None, reason, uses_cuda_graphs=state.x.is_cuda and not under_torch_transform())
 
 
-def still_drives(model: Model, substeps: int = 1) -> dict[str, Drive]:
-    """Drives in which every driven boundary is closed and stands still, to try an engine on."""
-    still = torch.eye(4, dtype=model.mass.dtype, device=model.mass.device).repeat(substeps, 1, 1)
+def stationary_prescribed(model: Model, substeps: int = 1) -> dict[str, PrescribedMotion]:
+    """Return motions in which every prescribed boundary is closed and stands still."""
+    identity = torch.eye(4, dtype=model.mass.dtype, device=model.mass.device).repeat(substeps, 1, 1)
     closed = (True,) * substeps
-    return {name: Drive(still, still, closed) for name, boundary in model.boundaries.items() if boundary.driven}
+    return {
+        name: PrescribedMotion(identity, identity, closed)
+        for name, part in model.boundaries.items()
+        if part.is_prescribed
+    }
 
 
-class _Elsewhere(Exception):
+class _UnsupportedTensors(Exception):
     """Tensors that the engine does not take."""
 
 
-def _on_device(model: Model, state: ClothState, drives: Mapping[str, Drive], trial: Trial | None) -> Choice:
-    """On CUDA; parts in torch are the reference's, as are tangents."""
-    if transformed():
-        raise _Elsewhere("tangents on cuda")
+def _choose_on_device(
+    model: Model, state: ClothState, prescribed: Mapping[str, PrescribedMotion], self_test: SelfTest | None
+) -> EngineChoice:
+    """On CUDA, the reference computes models with parts in torch, and tangents."""
+    if under_torch_transform():
+        raise _UnsupportedTensors("tangents on cuda")
     _check_dtype(state)
     library()  # it knows the kernels
-    fused = Fused(model, state, drives)
+    fused = FusedEngine(model, state, prescribed)
     if fused.torch_parts is not None:
-        raise _Elsewhere(f"{', '.join(sorted(fused.torch_parts.parts))} in torch, on cuda")
-    tried = devices.prepare(fused.low.program, state.x.device)
-    if not tried and trial is not None:
-        devices.try_out(_trials(model, state.x.shape[:-2], trial), fused.rounding)
-    return Choice(fused, "")
+        raise _UnsupportedTensors(f"{', '.join(sorted(fused.torch_parts.parts))} in torch, on cuda")
+    is_tested = devices.prepare(fused.builder.program, state.x.device)
+    if not is_tested and self_test is not None:
+        devices.run_self_test(_self_test_jobs(model, state.x.shape[:-2], self_test), fused.rounding)
+    return EngineChoice(fused, "")
 
 
-def _trials(model: Model, batch: torch.Size, trial: Trial) -> Iterator[Job]:
-    """Of two scenes each, with numbers that nobody derives."""
-    drives, batch = still_drives(model, TRIED), batch if batch.numel() > 1 else torch.Size((2,))
-    steps = torch.full((TRIED,), trial.dt, dtype=torch.float64)
-    for seed in range(TRIALS):
+def _self_test_jobs(model: Model, batch: torch.Size, self_test: SelfTest) -> Iterator[Job]:
+    """Jobs of two scenes each, with plain numbers."""
+    prescribed = stationary_prescribed(model, SELF_TEST_SUBSTEPS)
+    batch = batch if batch.numel() > 1 else torch.Size((2,))
+    steps = torch.full((SELF_TEST_SUBSTEPS,), self_test.dt, dtype=torch.float64)
+    for seed in range(SELF_TEST_SEEDS):
         with torch.no_grad():
-            state = trial.begin(batch, seed)
-            job = Fused(model, state, drives).job(state, steps, drives)
+            state = self_test.initial_state(batch, seed)
+            job = FusedEngine(model, state, prescribed).job(state, steps, prescribed)
         yield job._replace(inputs={f: t[:2] for f, t in job.inputs.items()}, scenes=2)
 
 
-def _fused(model: Model, state: ClothState, drives: Mapping[str, Drive]) -> Fused:
+def _fused_on_cpu(model: Model, state: ClothState, prescribed: Mapping[str, PrescribedMotion]) -> FusedEngine:
     if state.x.device.type != "cpu":
-        raise _Elsewhere(f"tensors on {state.x.device.type}")
+        raise _UnsupportedTensors(f"tensors on {state.x.device.type}")
     _check_dtype(state)
     library()
-    return Fused(model, state, drives)
+    return FusedEngine(model, state, prescribed)
 
 
 def _check_dtype(state: ClothState) -> None:
     if state.x.dtype not in (torch.float32, torch.float64):
-        raise _Elsewhere(str(state.x.dtype).removeprefix("torch."))
+        raise _UnsupportedTensors(str(state.x.dtype).removeprefix("torch."))
 
 
 @cache
-def _warn(text: str) -> None:
+def _warn_once(text: str) -> None:
     warnings.warn(text, stacklevel=6)

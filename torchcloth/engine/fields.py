@@ -2,20 +2,22 @@
 
 from __future__ import annotations
 
-from enum import IntEnum
 from typing import NamedTuple
 
-
-class Kind(IntEnum):
-    """What a field is; as in csrc/program.h."""
-
-    CONSTANT, PARAMETER, STATE, NEXT, TEMPORARY, KEPT, DRIVE, SUM, NODES, POINTS = range(10)
+from .enums import FieldKind
 
 
 class Field(NamedTuple):
-    """Rows of numbers, by the engine's number."""
+    """A field of a program.
+
+    Attributes:
+        id: number by which the engine knows it.
+        rows: rows; 0 where the contact search sizes it at run time.
+        comps: components of a row.
+        kind: what it holds.
+    """
 
     id: int
     rows: int
     comps: int
-    kind: Kind
+    kind: FieldKind

@@ -1,4 +1,4 @@
-"""The fused engine in the place of ``functional.rollout``."""
+"""The fused engine in the place of ``dynamics.substep.rollout``."""
 
 from __future__ import annotations
 
@@ -9,10 +9,10 @@ import torch
 from torch import Tensor
 from torch.utils.checkpoint import checkpoint as recompute
 
-from .._utils.torch_modes import transformed
-from ..boundaries import Drive
-from ..dynamics.contact.self_contact import CHUNK
-from ..dynamics.forces import Impulses, added
+from .._utils.torch_modes import under_torch_transform
+from ..boundaries import PrescribedMotion
+from ..dynamics.contact.self_contact import SUBSTEPS_PER_CHECKPOINT
+from ..dynamics.forces import Impulses, add_impulses
 from ..dynamics.model import Model
 from ..types import ClothState, Trajectory
 from . import conversion, devices, execution
@@ -22,21 +22,22 @@ from .operators import Rollout
 from .torch_parts import TorchParts, divide
 
 
-class Fused:
+class FusedEngine:
     """A model on the engine, for the length of one call of the cloth.
 
     Attributes:
-        low: the program, with the numbers of the model.
-        torch_parts: what torch computes in every substep; None: nothing, the engine runs by itself.
+        model: the model.
+        builder: the program, with the numbers of the model.
+        torch_parts: what torch computes in every substep; None: the engine runs by itself.
 
     Raises:
-        Unfused: a part without kernels that torch cannot take over either.
+        UnsupportedPart: a part has no kernels, and torch cannot take it over either.
     """
 
-    def __init__(self, model: Model, state: ClothState, drives: Mapping[str, Drive]) -> None:
+    def __init__(self, model: Model, state: ClothState, prescribed: Mapping[str, PrescribedMotion]) -> None:
         self.model = model
-        self._left = execution.BUDGET  # bytes of records that the adjoint may find ready
-        self.low, parts = divide(model, state, drives)
+        self._record_bytes_left = execution.RECORD_BUDGET_BYTES
+        self.builder, parts = divide(model, state, prescribed)
         self.torch_parts = TorchParts(model, parts) if parts else None
         self._coefficients: dict[Field, Tensor] = {}
 
@@ -44,182 +45,214 @@ class Fused:
         self,
         state: ClothState,
         dt: float,
-        drives: Mapping[str, Drive],
+        prescribed: Mapping[str, PrescribedMotion],
         substeps: int,
         first: int = 0,
         checkpoint: bool = True,
     ) -> tuple[ClothState, Impulses]:
-        """As ``functional.rollout``. ``checkpoint``: the adjoint keeps to a budget of memory, and recomputes beyond."""
-        state, _, total = self.stretch(state, None, dt, drives, substeps, first, checkpoint)
+        """Run substeps as ``dynamics.substep.rollout`` does.
+
+        ``checkpoint``: the adjoint keeps to a budget of memory, and recomputes what exceeds it.
+        """
+        state, _, total = self.rollout_segment(state, None, dt, prescribed, substeps, first, checkpoint)
         return state, total
 
-    def stretch(
+    def rollout_segment(
         self,
         state: ClothState,
-        lost: Tensor | None,
+        compensation: Tensor | None,
         dt: float,
-        drives: Mapping[str, Drive],
+        prescribed: Mapping[str, PrescribedMotion],
         substeps: int,
         first: int = 0,
         checkpoint: bool = True,
     ) -> tuple[ClothState, Tensor | None, Impulses]:
-        """As ``functional.stretch``."""
+        """Run substeps as ``dynamics.substep.rollout_segment`` does; ``checkpoint`` as for ``rollout``."""
         steps = torch.full((first + substeps,), dt, dtype=torch.float64)
-        fixed, moves = self.coefficients(_batch(state)), self.moves(state, drives, steps)
+        fixed, rows = self.coefficients(_batch(state)), self.substep_inputs(state, prescribed, steps)
         if self.torch_parts is None:
-            return self._call(state, lost, fixed | _cut(moves, first, first + substeps), substeps, checkpoint)
+            inputs = fixed | _substep_rows(rows, first, first + substeps)
+            return self._call(state, compensation, inputs, substeps, checkpoint)
         total: Impulses = {}
-        again = checkpoint and recomputes()
-        parts = self.torch_parts.as_they_are() if again else self.torch_parts
+        recomputes = checkpoint and may_recompute()
+        parts = self.torch_parts.with_frozen_parameters() if recomputes else self.torch_parts
         last = first + substeps
-        for begin in range(first, last, CHUNK):
-            chunk = range(begin, min(begin + CHUNK, last))
-            run = partial(self._shared, parts, dt, fixed, moves, chunk)
-            state, lost, impulses = recompute(run, state, lost, use_reentrant=False) if again else run(state, lost)
-            total = added(total, impulses)
-        return state, lost, total
+        for begin in range(first, last, SUBSTEPS_PER_CHECKPOINT):
+            chunk = range(begin, min(begin + SUBSTEPS_PER_CHECKPOINT, last))
+            run = partial(self._run_with_torch, parts, dt, fixed, rows, chunk)
+            if recomputes:
+                state, compensation, impulses = recompute(run, state, compensation, use_reentrant=False)
+            else:
+                state, compensation, impulses = run(state, compensation)
+            total = add_impulses(total, impulses)
+        return state, compensation, total
 
     def frames(
         self,
         state: ClothState,
-        lost: Tensor | None,
+        compensation: Tensor | None,
         steps: Tensor,
-        drives: Mapping[str, Drive],
-        ends: tuple[int, ...],
+        prescribed: Mapping[str, PrescribedMotion],
+        frame_ends: tuple[int, ...],
     ) -> list[tuple[ClothState, Tensor | None, Impulses]]:
-        """As ``stretch``, after so many substeps each, with the impulses since the one before.
+        """Run substeps as ``rollout_segment`` does, with a result at every frame; only where ``is_plain``.
 
-        Of what ``is_plain``; ``steps``: [substeps] s.
+        Args:
+            state: at the start.
+            compensation: at the start.
+            steps: [substeps] s.
+            prescribed: motions by boundary.
+            frame_ends: substeps after which there is a frame; impulses are those since the frame before.
         """
-        results, _ = devices.forward(self.job(state, steps, drives, lost)._replace(ends=ends))
-        found = []
+        job = self.job(state, steps, prescribed, compensation)._replace(frame_ends=frame_ends)
+        results, _ = devices.forward(job)
+        frames = []
         for row in zip(*(t.unbind(1) for t in results.values()), strict=True):
-            found.append(conversion.outcome(self.low, state, dict(zip(results, row, strict=True)), _batch(state)))
-        last, lost, impulses = found[-1]  # who keeps it keeps no other frames
-        return [*found[:-1], (last.map(torch.clone), None if lost is None else lost.clone(), impulses)]
+            values = dict(zip(results, row, strict=True))
+            frames.append(conversion.unflatten_results(self.builder, state, values, _batch(state)))
+        last, compensation, impulses = frames[-1]  # its own memory: who keeps the last frame keeps no other
+        return [
+            *frames[:-1],
+            (last.map(torch.clone), None if compensation is None else compensation.clone(), impulses),
+        ]
 
     @property
     def has_tangents(self) -> bool:
-        """Whether ``FusedTangents`` is for it."""
-        return self.torch_parts is None and not self.is_elsewhere
+        """Whether ``FusedTangents`` supports it."""
+        return self.torch_parts is None and not self.is_on_device
 
     @property
-    def is_elsewhere(self) -> bool:
-        """Whether its tensors are on a device."""
-        return devices.elsewhere(self.model.mass)
+    def is_on_device(self) -> bool:
+        """Whether its tensors are on a device other than the CPU."""
+        return devices.is_on_device(self.model.mass)
 
     @property
     def rounding(self) -> Field | None:
-        """The result that holds what was lost in float32, and has no digits of its own; None in float64."""
-        return None if self.low.lost is None else self.low.lost.after
+        """The result with the compensation in float32, which has no significant digits; None in float64."""
+        return None if self.builder.compensation is None else self.builder.compensation.after
 
     def is_plain(self, state: ClothState, motion: Mapping[str, Trajectory]) -> bool:
-        """The engine runs by itself on numbers from which nobody wants a derivative."""
-        given = [state.x, state.v, state.d3, *state.memory.values(), *self.low.inputs.values()]
-        moves = [part for m in motion.values() for part in (m.t, m.pose)]
-        return self.torch_parts is None and _are_numbers([*given, *moves])
+        """Return whether the engine runs by itself, on numbers of which nobody wants a derivative."""
+        tensors = [state.x, state.v, state.d3, *state.memory.values(), *self.builder.inputs.values()]
+        motions = [part for m in motion.values() for part in (m.t, m.pose)]
+        return self.torch_parts is None and _are_plain_numbers([*tensors, *motions])
 
-    def job(self, state: ClothState, steps: Tensor, drives: Mapping[str, Drive], lost: Tensor | None = None) -> Job:
-        """What the engine is given, as plain numbers; without parts in torch."""
-        batch, program = _batch(state), self.low.program
-        found = self.coefficients(batch) | self.moves(state, drives, steps)
-        found |= conversion.flat(self.low, conversion.state_inputs(self.low, state, lost), batch)
-        return Job(program, {field: found[field] for field in program.inputs}, batch.numel(), len(steps))
+    def job(
+        self,
+        state: ClothState,
+        steps: Tensor,
+        prescribed: Mapping[str, PrescribedMotion],
+        compensation: Tensor | None = None,
+    ) -> Job:
+        """Return the program with all numbers of a call; not for models with parts in torch."""
+        batch, program = _batch(state), self.builder.program
+        inputs = self.coefficients(batch) | self.substep_inputs(state, prescribed, steps)
+        variables = conversion.state_inputs(self.builder, state, compensation)
+        inputs |= conversion.flatten_batch(self.builder, variables, batch)
+        return Job(program, {field: inputs[field] for field in program.inputs}, batch.numel(), len(steps))
 
     def coefficients(self, batch: torch.Size) -> dict[Field, Tensor]:
-        """Inputs that stay the same over the substeps of a call."""
+        """Return the inputs that stay the same over the substeps of a call."""
         if not self._coefficients:
-            self._coefficients = conversion.flat(self.low, self.low.inputs, batch)
-            if self.torch_parts is not None and recomputes():  # then parameters may have other values
+            self._coefficients = conversion.flatten_batch(self.builder, self.builder.inputs, batch)
+            if self.torch_parts is not None and may_recompute():  # parameters may have other values by then
                 self._coefficients = {field: t.clone() for field, t in self._coefficients.items()}
         return self._coefficients
 
-    def moves(self, state: ClothState, drives: Mapping[str, Drive], steps: Tensor) -> dict[Field, Tensor]:
-        """Inputs with a row for every substep; ``steps``: [substeps] s."""
-        found = {**conversion.drive_inputs(self.low, drives), self.low.dt: steps.unsqueeze(-1)}
-        return conversion.flat(self.low, found, _batch(state))
+    def substep_inputs(
+        self, state: ClothState, prescribed: Mapping[str, PrescribedMotion], steps: Tensor
+    ) -> dict[Field, Tensor]:
+        """Return the inputs with a row for every substep; ``steps``: [substeps] s."""
+        inputs = {**conversion.prescribed_inputs(self.builder, prescribed), self.builder.dt: steps.unsqueeze(-1)}
+        return conversion.flatten_batch(self.builder, inputs, _batch(state))
 
-    def _shared(
+    def _run_with_torch(
         self,
         parts: TorchParts,
         dt: float,
         fixed: dict[Field, Tensor],
-        moves: dict[Field, Tensor],
+        rows: dict[Field, Tensor],
         substeps: range,
         state: ClothState,
-        lost: Tensor | None,
+        compensation: Tensor | None,
     ) -> tuple[ClothState, Tensor | None, Impulses]:
-        """Substeps in which torch has a part."""
         total: Impulses = {}
         for k in substeps:
-            force, memory = parts.force(state, lost, dt)
-            state, lost, impulses = self._call(state, lost, fixed | _cut(moves, k, k + 1), 1, False, force)
+            force, memory = parts.force(state, compensation, dt)
+            inputs = fixed | _substep_rows(rows, k, k + 1)
+            state, compensation, impulses = self._call(state, compensation, inputs, 1, False, force)
             state = state._replace(memory=state.memory | memory)
-            total = added(total, impulses)
-        return state, lost, total
+            total = add_impulses(total, impulses)
+        return state, compensation, total
 
     def _call(
         self,
         state: ClothState,
-        lost: Tensor | None,
-        others: dict[Field, Tensor],
+        compensation: Tensor | None,
+        inputs: dict[Field, Tensor],
         substeps: int,
         checkpoint: bool,
         force: Tensor | None = None,
     ) -> tuple[ClothState, Tensor | None, Impulses]:
-        low, program, batch = self.low, self.low.program, _batch(state)
-        begin = conversion.state_inputs(low, state, lost)
-        if low.torch_force is not None and force is not None:
-            begin[low.torch_force] = force
-        by_field = others | conversion.flat(low, begin, batch)
-        inputs = [by_field[field] for field in program.inputs]
-        if _are_numbers(inputs):
-            job = Job(program, dict(zip(program.inputs, inputs, strict=True)), batch.numel(), substeps)
-            return conversion.outcome(low, state, devices.forward(job)[0], batch)
-        every = self._every(batch.numel(), substeps, checkpoint) if _needs_gradient(inputs) else 0
-        *results, _ = Rollout.apply(program.number, substeps, every, *inputs)  # type: ignore[misc]
-        return conversion.outcome(low, state, dict(zip(program.outputs, results, strict=True)), batch)
+        builder, program, batch = self.builder, self.builder.program, _batch(state)
+        variables = conversion.state_inputs(builder, state, compensation)
+        if builder.torch_force is not None and force is not None:
+            variables[builder.torch_force] = force
+        by_field = inputs | conversion.flatten_batch(builder, variables, batch)
+        tensors = [by_field[field] for field in program.inputs]
+        if _are_plain_numbers(tensors):
+            job = Job(program, dict(zip(program.inputs, tensors, strict=True)), batch.numel(), substeps)
+            return conversion.unflatten_results(builder, state, devices.forward(job)[0], batch)
+        interval = self._record_interval(batch.numel(), substeps, checkpoint) if _needs_gradient(tensors) else 0
+        *outputs, _ = Rollout.apply(program.number, substeps, interval, *tensors)  # type: ignore[misc]
+        results = dict(zip(program.outputs, outputs, strict=True))
+        return conversion.unflatten_results(builder, state, results, batch)
 
-    def _every(self, scenes: int, substeps: int, checkpoint: bool) -> int:
-        """Substeps between records: all while the budget lasts; 0: the adjoint makes its own when it comes here."""
-        if self.is_elsewhere:
+    def _record_interval(self, scenes: int, substeps: int, checkpoint: bool) -> int:
+        """Substeps between records: 1 while the budget lasts; 0: the adjoint makes records itself."""
+        if self.is_on_device:
             return 0
         if not checkpoint:
             return 1
-        size = execution.full_size(self.low.program, scenes, substeps)
-        if size > self._left:
+        size = execution.full_size(self.builder.program, scenes, substeps)
+        if size > self._record_bytes_left:
             return 0
-        self._left -= size
+        self._record_bytes_left -= size
         return 1
 
 
-def rollout(model: Model, state: ClothState, dt: float, drives: Mapping[str, Drive], substeps: int):
-    """As ``functional.rollout``, from substep 0 of the drives.
+def rollout(model: Model, state: ClothState, dt: float, prescribed: Mapping[str, PrescribedMotion], substeps: int):
+    """Run substeps as ``dynamics.substep.rollout`` does, from substep 0 of the prescribed motions.
 
     Raises:
-        Unfused: a part without kernels.
+        UnsupportedPart: a part has no kernels.
     """
-    return Fused(model, state, drives).rollout(state, dt, drives, substeps)
+    return FusedEngine(model, state, prescribed).rollout(state, dt, prescribed, substeps)
 
 
 def _batch(state: ClothState) -> torch.Size:
     return state.x.shape[:-2]
 
 
-def _cut(moves: Mapping[Field, Tensor], first: int, last: int) -> dict[Field, Tensor]:
-    """The rows of some substeps."""
-    return {field: rows[:, first:last].contiguous() for field, rows in moves.items()}
+def _substep_rows(rows: Mapping[Field, Tensor], first: int, last: int) -> dict[Field, Tensor]:
+    return {field: t[:, first:last].contiguous() for field, t in rows.items()}
 
 
-def recomputes() -> bool:
-    """Whether a backward pass may come that can compute again; ``torch.func`` knows of no tensors that are not kept."""
+def may_recompute() -> bool:
+    """Return whether a backward pass may follow that can compute again.
+
+    ``torch.func`` knows no saved tensors, so under its transforms there is none.
+    """
     return torch.is_grad_enabled() and not torch._C._are_functorch_transforms_active()
 
 
-def _are_numbers(inputs: list[Tensor]) -> bool:
-    """And nothing else: nobody needs to know of the operator, which costs as much as some tens of substeps."""
-    return not transformed() and all(type(t) is Tensor for t in inputs) and not _needs_gradient(inputs)
+def _are_plain_numbers(tensors: list[Tensor]) -> bool:
+    """Whether all are plain tensors without gradients.
+
+    The autograd operator can then be skipped, which costs as much as some tens of substeps.
+    """
+    return not under_torch_transform() and all(type(t) is Tensor for t in tensors) and not _needs_gradient(tensors)
 
 
-def _needs_gradient(inputs: list[Tensor]) -> bool:
-    return torch.is_grad_enabled() and any(t.requires_grad for t in inputs)
+def _needs_gradient(tensors: list[Tensor]) -> bool:
+    return torch.is_grad_enabled() and any(t.requires_grad for t in tensors)

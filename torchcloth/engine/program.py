@@ -1,8 +1,8 @@
 """Programs of the engine: what one substep does, as stages that run one after the other on fields of numbers.
 
-A program is written down first and handed to the engine by ``ready``, unless the engine has the same one already: the
-programs of two calls are the same where every constant, index and instruction is, so nothing that a user changes in
-the parts can be missed, and nothing is built twice.
+A program is recorded first. ``finish`` then hands it to the engine, unless the engine has an identical one already. Two
+programs are identical if every constant, index and instruction is. So no change that a user makes to the parts can be
+missed, and no program is built twice.
 """
 
 from __future__ import annotations
@@ -23,30 +23,38 @@ import numpy as np
 import torch
 from numpy.typing import ArrayLike
 
-from .constants import array
-from .fields import Field, Kind
+from .enums import ITEM_ROW, ContactCount, FieldKind, RunMode, StencilForm
+from .fields import Field
+from .host_arrays import to_numpy
 from .library import library
-from .loops import OWN, Loop
-from .stages import Layers, PerMass, PointTables, Shape, Sieve, Stencil
+from .loops import Loop
+from .stages import ContactSearch, GridVelocity, PointBroadPhase, PointTables, Stencil
+
+MAX_CACHED_PROGRAMS = 64  # programs that wait for the next call, besides those in use
 
 
 class Program:
-    """What one substep does, for cloths of one structure and precision."""
+    """What one substep does, for cloths of one structure and precision.
+
+    Args:
+        dtype: precision.
+        vertices: vertices of the mesh.
+    """
 
     def __init__(self, dtype: torch.dtype, vertices: int) -> None:
         self.dtype, self.vertices = dtype, vertices
-        self.number = -1  # by which the operators know it; there is none before it is ready
-        self._letter = "d" if dtype == torch.float64 else "f"
+        self.number = -1  # by which the operators know it, from ``finish`` on
+        self._suffix = "d" if dtype == torch.float64 else "f"
         self._numpy = np.float64 if dtype == torch.float64 else np.float32
         self._handle: ctypes.c_void_p | None = None
         self.fields: list[Field] = []
         self._constants: dict[bytes, Field] = {}
         self._tables: dict[bytes, int] = {}
-        self._reach: list[int] = []  # of each table: rows that it needs
-        self._stages: list[Loop | Stencil | Sieve | Layers | PerMass] = []
-        self._lists = 0
-        self._written: list[tuple[str, tuple]] = []
-        self.written: list[tuple[str, tuple]] = []  # names and arguments, of a program that keeps them: see ``ready``
+        self._table_rows: list[int] = []  # rows that each table needs
+        self._stages: list[Loop | Stencil | PointBroadPhase | ContactSearch | GridVelocity] = []
+        self._point_lists = 0
+        self._calls: list[tuple[str, tuple]] = []
+        self.recorded_calls: list[tuple[str, tuple]] = []  # names and arguments, where ``finish`` was asked for them
 
     def __del__(self) -> None:
         # there is no handle where ``__init__`` was not run, and no library when Python ends
@@ -55,217 +63,244 @@ class Program:
 
     # -- fields ---------------------------------------------------------------------------------------------------
 
-    def constant(self, values: ArrayLike | torch.Tensor, near: int = 0) -> Field:
-        """Numbers [rows, comps] that never change; ``near``: the weights [count near V, 1] of a stencil."""
-        data = np.ascontiguousarray(array(values), dtype=self._numpy)
-        key = data.tobytes() + f"{near} {data.shape}".encode()
+    def constant(self, values: ArrayLike | torch.Tensor, neighbours: int = 0) -> Field:
+        """Return a field of numbers [rows, comps] that never change.
+
+        ``neighbours``: N of the weights [count N V, 1] of a stencil, else 0.
+        """
+        data = np.ascontiguousarray(to_numpy(values), dtype=self._numpy)
+        key = data.tobytes() + f"{neighbours} {data.shape}".encode()
         if key not in self._constants:
-            self._constants[key] = self._field(Kind.CONSTANT, data.shape[0], data.shape[1], near, data)
+            rows, comps = data.shape
+            self._constants[key] = self._field(FieldKind.CONSTANT, rows, comps, neighbours, data)
         return self._constants[key]
 
-    def parameter(self, rows: int, comps: int, near: int = 0) -> Field:
-        """An input with a derivative; ``near``: as for ``constant``."""
-        return self._field(Kind.PARAMETER, rows, comps, near)
+    def parameter(self, rows: int, comps: int, neighbours: int = 0) -> Field:
+        """Return a field for an input with a derivative; ``neighbours`` as for ``constant``."""
+        return self._field(FieldKind.PARAMETER, rows, comps, neighbours)
 
     def state(self, rows: int, comps: int) -> tuple[Field, Field]:
-        """(what is carried, where it goes at the end of the substep)."""
-        now, after = self._field(Kind.STATE, rows, comps), self._field(Kind.NEXT, rows, comps)
-        self._api("pair")(self._handle, now.id, after.id)
+        """Return the fields of a state variable at the start and at the end of the substep."""
+        now, after = self._field(FieldKind.STATE, rows, comps), self._field(FieldKind.NEXT, rows, comps)
+        self._api("next_state")(self._handle, now.id, after.id)
         return now, after
 
-    def temporary(self, rows: int, comps: int, kept: bool = True) -> Field:
-        """Zero at the start of a substep; ``kept``: loops read it, so the reverse sweep must know it."""
-        return self._field(Kind.KEPT if kept else Kind.TEMPORARY, rows, comps)
+    def temporary(self, rows: int, comps: int, is_recorded: bool = True) -> Field:
+        """Return a field that is zero at the start of a substep.
 
-    def drive(self, comps: int) -> Field:
-        """An input with one row for every substep."""
-        return self._field(Kind.DRIVE, 1, comps)
+        ``is_recorded``: loops read it, so the reverse sweep must know it.
+        """
+        return self._field(FieldKind.RECORDED if is_recorded else FieldKind.TEMPORARY, rows, comps)
+
+    def per_substep(self, comps: int) -> Field:
+        """Return a field for an input with one row for every substep."""
+        return self._field(FieldKind.PER_SUBSTEP, 1, comps)
 
     def sum(self, comps: int) -> Field:
-        """Added up over the substeps before a result."""
-        return self._field(Kind.SUM, 1, comps)
+        """Return a field that is summed over the substeps before a result."""
+        return self._field(FieldKind.SUM, 1, comps)
 
     def nodes(self) -> Field:
-        """Of contact, which sees to its memory: mass and a vector of the nodes that are touched."""
-        return self._field(Kind.NODES, 0, 4)
+        """Return a field with mass and a vector of each active node; the contact search sizes it."""
+        return self._field(FieldKind.NODES, 0, 4)
 
     def points(self, comps: int) -> Field:
-        """What varying loops over points tell each other; put once in a substep."""
-        return self._field(Kind.POINTS, 0, comps)
+        """Return a field that loops over contact points hand to each other; it is stored once in a substep."""
+        return self._field(FieldKind.POINTS, 0, comps)
 
     def table(self, index: np.ndarray | torch.Tensor) -> int:
-        """Rows to gather from or scatter to, one per item."""
-        data = np.ascontiguousarray(array(index), dtype=np.int32).ravel()
+        """Return the number of a table of rows to gather from or scatter to, one row per item.
+
+        Raises:
+            ValueError: a row is negative.
+        """
+        data = np.ascontiguousarray(to_numpy(index), dtype=np.int32).ravel()
         key = data.tobytes()
         if data.min(initial=0) < 0:
             raise ValueError(f"rows {data.min()}: negative")
         if key not in self._tables:
             self._tables[key] = len(self._tables)
-            self._reach.append(int(data.max(initial=-1)) + 1)
+            self._table_rows.append(int(data.max(initial=-1)) + 1)
             self._api("table")(self._handle, data, len(data))
         return self._tables[key]
 
-    def _field(self, kind: Kind, rows: int, comps: int, near: int = 0, data: np.ndarray | None = None) -> Field:
+    def _field(
+        self, kind: FieldKind, rows: int, comps: int, neighbours: int = 0, data: np.ndarray | None = None
+    ) -> Field:
         field = Field(len(self.fields), rows, comps, kind)
-        self._api("field")(self._handle, int(kind), rows, comps, near, self.vertices, data)
+        self._api("field")(self._handle, int(kind), rows, comps, neighbours, self.vertices, data)
         self.fields.append(field)
         return field
 
     # -- stages ---------------------------------------------------------------------------------------------------
 
-    def loop(self, items: int, order: np.ndarray | None = None, flat: bool = False) -> Loop:
-        """Runs after all stages that are there already.
+    def loop(self, items: int, order: np.ndarray | None = None, no_derivative: bool = False) -> Loop:
+        """Append a loop, which runs after all present stages.
 
         Args:
-            items: rows.
-            order: in which they are gone through.
-            flat: what it gives has no derivative.
+            items: items of the loop.
+            order: [items] order in which they are visited.
+            no_derivative: results have no derivative.
         """
-        self._stages.append(Loop(items, self._reach, OWN if order is None else self.table(order), flat=flat))
+        item_table = ITEM_ROW if order is None else self.table(order)
+        self._stages.append(Loop(items, self._table_rows, item_table, no_derivative=no_derivative))
         return self._stages[-1]  # type: ignore[return-value]
 
-    def first(self) -> Loop:
-        """Runs before all stages that are there already, once."""
-        self._stages.insert(0, Loop(1, self._reach))
+    def setup_loop(self) -> Loop:
+        """Insert a loop of one item that runs before all present stages."""
+        self._stages.insert(0, Loop(1, self._table_rows))
         return self._stages[0]  # type: ignore[return-value]
 
-    def among(self, near: int, flat: bool = False) -> Loop:
-        """On those points alone that a sieve has found; ``flat`` as for ``loop``."""
-        self._stages.append(Loop(0, self._reach, among=near, flat=flat))
+    def loop_over_points(self, point_list: int, no_derivative: bool = False) -> Loop:
+        """Append a loop over the points that a broad phase lists; ``no_derivative`` as for ``loop``."""
+        self._stages.append(Loop(0, self._table_rows, point_list=point_list, no_derivative=no_derivative))
         return self._stages[-1]  # type: ignore[return-value]
 
-    def varying(self, count: int, again: bool = False) -> Loop:
-        """A loop over what contact finds, number ``count``; ``again``: it writes what is not recorded, and is read."""
-        self._stages.append(Loop(0, self._reach, counted=count, again=again))
+    def loop_over_contact(self, points: ContactCount, is_replayed: bool = False) -> Loop:
+        """Append a loop over points that the contact search lists; ``is_replayed`` as for ``Loop``."""
+        self._stages.append(Loop(0, self._table_rows, contact_count=points, is_replayed=is_replayed))
         return self._stages[-1]  # type: ignore[return-value]
 
-    def contact(self, layers: Layers) -> None:
-        """Find at every substep what the varying loops run over."""
-        self._stages.append(layers)
+    def contact_search(self, search: ContactSearch) -> None:
+        """Append the search that lists contact points at every substep."""
+        self._stages.append(search)
 
-    def per_mass(self, mass: Field, given: Field, out: Field, least: float) -> None:
-        """out = given / mass on the nodes, where the mass is more than ``least``; see ``csrc/per_mass.h``."""
-        self._stages.append(PerMass(mass, given, out, least))
+    def grid_velocity(self, mass: Field, momentum: Field, velocity: Field, min_mass: float) -> None:
+        """Append velocity = momentum / mass on the nodes where the mass exceeds ``min_mass`` [kg].
 
-    def sieve(self, x: Field, reach: Field, dt: Field, points: PointTables, steep: float) -> int:
-        """A list of the points on triangles that may touch a body in this substep; see ``csrc/sieve.h``.
+        See ``csrc/grid_momentum_to_velocity.h``.
+        """
+        self._stages.append(GridVelocity(mass, momentum, velocity, min_mass))
+
+    def broad_phase(self, x: Field, approach: Field, dt: Field, points: PointTables, lipschitz: float) -> int:
+        """Append a broad phase; return the number of its list of points that may touch a body in this substep.
+
+        See ``csrc/broad_phase.h``.
 
         Args:
-            x: [V, 3] positions.
-            reach: [V, 2] distances of the vertices to the body and speeds relative to it.
-            dt: substep.
-            points: of the triangles.
-            steep: how much the distance may change along a way of length 1.
+            x: [V, 3] positions [m].
+            approach: [V, 2] distances of the vertices to the body [m] and speeds relative to it [m/s].
+            dt: substep [s].
+            points: tables of the sample points.
+            lipschitz: Lipschitz constant of the body's distance function.
         """
-        self._lists += 1
-        self._stages.append(Sieve(self._lists - 1, x, reach, dt, points, steep))
-        return self._lists - 1
+        self._point_lists += 1
+        self._stages.append(PointBroadPhase(self._point_lists - 1, x, approach, dt, points, lipschitz))
+        return self._point_lists - 1
 
-    def stencil(self, near: np.ndarray, weight: Field, x: Field, y: Field, shape: Shape = Shape.PLAIN) -> None:
-        """y += differences of x over ``near`` [N, V] with weights [count, N, V]; transposed: x -= transpose of y."""
-        self._stages.append(Stencil(self.table(near), weight, x, y, shape))
+    def stencil(
+        self, near: np.ndarray, weight: Field, x: Field, y: Field, form: StencilForm = StencilForm.PLAIN
+    ) -> None:
+        """Append y += weighted differences of x over the neighbours ``near`` [N, V]; weights are [count, N, V].
 
-    def ready(self, keep: bool = False) -> Program:
-        """The program to run: an earlier one where there is the same, else this one, handed to the engine.
+        The transposed form subtracts the transpose of y from x.
+        """
+        self._stages.append(Stencil(self.table(near), weight, x, y, form))
 
-        ``keep``: what was written down, for another compiler.
+    def finish(self, keep_calls: bool = False) -> Program:
+        """Return the program to run: an identical earlier one, else this one after handing it to the engine.
+
+        ``keep_calls``: keep the recorded calls, for another compiler.
         """
         for stage in self._stages:
             stage.emit(self._handle, self._api)
         key = self._key()
-        with _KEEPING:  # nobody may run a program that another thread is still handing over
-            known = _KEPT.get(key)
-            if known is None:
-                self._hand_over()  # what is interrupted is not kept: it would pass for the whole
-                _KEPT[key] = known = self
-                while len(_KEPT) > MOST_KEPT:
-                    _KEPT.popitem(last=False)
-            _KEPT.move_to_end(key)
-        if keep and not known.written:
-            known.written = self._written
-        self._written = []
-        return known
+        with _cache_lock:  # nobody may run a program that another thread is still handing over
+            program = _cache.get(key)
+            if program is None:
+                self._hand_over()  # an interrupted program is not cached: it would pass for the whole one
+                _cache[key] = program = self
+                while len(_cache) > MAX_CACHED_PROGRAMS:
+                    _cache.popitem(last=False)
+            _cache.move_to_end(key)
+        if keep_calls and not program.recorded_calls:
+            program.recorded_calls = self._calls
+        self._calls = []
+        return program
 
     @cached_property
     def inputs(self) -> list[Field]:
-        """States, parameters and drives, in the order in which the operators take them."""
-        return [f for f in self.fields if f.kind in (Kind.STATE, Kind.PARAMETER, Kind.DRIVE)]
+        """States, parameters and inputs per substep, in the order in which the operators take them."""
+        return [f for f in self.fields if f.kind in (FieldKind.STATE, FieldKind.PARAMETER, FieldKind.PER_SUBSTEP)]
 
     @cached_property
     def outputs(self) -> list[Field]:
-        """Nexts and sums, in the order in which the operators give them."""
-        return [f for f in self.fields if f.kind in (Kind.NEXT, Kind.SUM)]
+        """States after the substep and sums, in the order in which the operators return them."""
+        return [f for f in self.fields if f.kind in (FieldKind.NEXT, FieldKind.SUM)]
 
     def record_size(self, full: bool) -> int:
-        """Numbers of a record: of the state alone, or of all that the reverse sweep reads."""
-        return self._call("size", int(full))
+        """Return the count of numbers in a record: the state alone, or (full) all that the reverse sweep reads."""
+        return self._call("record_size", int(full))
 
-    def records_size(self, substeps: int, every: int) -> int:
-        """Numbers of all records of a scene, with what contact notes."""
-        return self._call("records", substeps, every)
+    def records_size(self, substeps: int, record_interval: int) -> int:
+        """Return the count of numbers in all records of a scene, with the active triangles of contact."""
+        return self._call("records_size", substeps, record_interval)
 
-    def run(self, call, mode: int) -> None:
-        """0: values, 1: adjoint, 2: tangents."""
-        _check(self._call("run", ctypes.byref(call), mode))
+    def run(self, call: ctypes.Structure, mode: RunMode) -> None:
+        """Run the program on the memory that ``call`` describes.
+
+        Raises:
+            RuntimeError: the engine fails.
+        """
+        _check(self._call("run", ctypes.byref(call), int(mode)))
 
     def _api(self, name: str) -> Callable[..., int]:
-        """Stands for a function of the library: what it is called with (numbers and arrays) is written down."""
+        """Return a stand-in for a function of the library that records its arguments (numbers and arrays)."""
 
-        def write(handle: Any, *arguments) -> int:
-            self._written.append((name, arguments))
+        def record(handle: Any, *arguments) -> int:
+            self._calls.append((name, arguments))
             return 0
 
-        return write
+        return record
 
     def _key(self) -> bytes:
-        """All that was written down, arrays included; version 0 of marshal knows no references between objects."""
-        return hashlib.sha256(self._letter.encode() + marshal.dumps(self._written, 0)).digest()
+        """Hash of all recorded calls, arrays included; version 0 of marshal knows no references between objects."""
+        return hashlib.sha256(self._suffix.encode() + marshal.dumps(self._calls, 0)).digest()
 
     def _hand_over(self) -> None:
-        self._handle = ctypes.c_void_p(getattr(library(), f"tc_new_{self._letter}")())
+        self._handle = ctypes.c_void_p(getattr(library(), f"tc_new_{self._suffix}")())
         _check(not self._handle)
-        for name, arguments in self._written:
-            done = self._call(name, *(_for_c(a) for a in arguments))
-            _check(done < 0 if name in ("field", "table") else done)  # these give a number
-        _check(self._call("ready"))
-        self.number = next(_NUMBERS)
-        _KNOWN[self.number] = self
+        for name, arguments in self._calls:
+            status = self._call(name, *(_to_c(a) for a in arguments))
+            _check(status < 0 if name in ("field", "table") else status)  # these return a number
+        _check(self._call("lay_out"))
+        self.number = next(_numbers)
+        _by_number[self.number] = self
 
     def _call(self, name: str, *arguments) -> Any:
-        return getattr(library(), f"tc_{name}_{self._letter}")(self._handle, *arguments)
+        return getattr(library(), f"tc_{name}_{self._suffix}")(self._handle, *arguments)
 
 
-MOST_KEPT = 64  # programs that wait for the next call, besides those that are in use
-_KEPT: OrderedDict[bytes, Program] = OrderedDict()
-_KNOWN: WeakValueDictionary[int, Program] = WeakValueDictionary()
-_NUMBERS = count()
-_KEEPING = Lock()
+_cache: OrderedDict[bytes, Program] = OrderedDict()
+_by_number: WeakValueDictionary[int, Program] = WeakValueDictionary()
+_numbers = count()
+_cache_lock = Lock()
 
 
-def _after_fork() -> None:
-    """Another thread of the parent may have held it, and is not here to let go."""
-    global _KEEPING
-    _KEEPING = Lock()
+def _replace_lock() -> None:
+    """Replace the lock after a fork: a thread that held it in the parent does not exist in the child."""
+    global _cache_lock
+    _cache_lock = Lock()
 
 
 if hasattr(os, "register_at_fork"):
-    os.register_at_fork(after_in_child=_after_fork)
+    os.register_at_fork(after_in_child=_replace_lock)
 
 
-def _for_c(value: Any) -> Any:
-    """Arrays by their memory, tuples as arrays of int."""
+def _to_c(value: Any) -> Any:
+    """Arrays as pointers to their memory, tuples as arrays of int."""
     if isinstance(value, np.ndarray):
         return value.ctypes.data
     return (ctypes.c_int * len(value))(*value) if isinstance(value, tuple) else value
 
 
-def program_of(number: int) -> Program:
-    """The program that an operator was given by its number.
+def program_by_number(number: int) -> Program:
+    """Return the program that an operator was given by its number.
 
     Raises:
-        KeyError: nobody holds it any more.
+        KeyError: the program does not exist any more.
     """
-    return _KNOWN[number]
+    return _by_number[number]
 
 
 def _check(code: int) -> None:

@@ -1,94 +1,129 @@
-"""Stages of a program that are not loops: stencils, the sieve of points near a body, the search for layers."""
+"""Stages of a program that are not loops: stencils, the broad phase of points near a body, the contact search."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from enum import IntEnum
 from typing import NamedTuple
 
 import numpy as np
 
+from .enums import PATCH_TRIANGLES, StencilForm
 from .fields import Field
 
-PATCH = 8  # triangles of a patch, as in csrc/search.h: a bit of a byte for each
 
+class ContactSearch(NamedTuple):
+    """Search for the triangles that may touch another layer, and layout of the grid; see ``csrc/contact.h``.
 
-class Shape(IntEnum):
-    """Of a stencil's operator; as in csrc/stencil.h."""
+    Attributes:
+        fields: positions, lowest node of each point, fields of the nodes, fields of the points.
+        corners: [3, E] int32, vertices of the triangles.
+        places: [S, 3] float64, barycentric coordinates of a triangle's contact points.
+        lengths: (spacing, skin, reach) of the grid [m].
+        search_interval: substeps after which the search is repeated in any case.
+        order: [E] int32, triangles patch by patch.
+        patch_starts: [patches + 1] int32; [1] where all triangles are always active.
+        patches_may_meet: [patches, patches] uint8, whether two patches have triangles that may touch.
+        non_adjacent: [E, patches] uint8, one bit for each triangle of a patch.
+    """
 
-    PLAIN, TRANSPOSED, SYMMETRIC = range(3)
-
-
-class Layers(NamedTuple):
-    """Contact between layers: which triangles may take part, and the grid; see csrc/contact.h."""
-
-    fields: Sequence[Field]  # positions, lowest node of each point, fields of the nodes
-    corners: np.ndarray  # [3, E] int32
-    places: np.ndarray  # [S, 3] float64, barycentric
-    lengths: tuple[float, float, float]  # spacing, skin, reach [m]
-    chunk: int
-    order: np.ndarray  # [E] int32, patch by patch
-    starts: np.ndarray  # [patches + 1] int32; [1]: all triangles take part always
-    meet: np.ndarray  # [patches, patches] uint8
-    apart: np.ndarray  # [E, patches] uint8, a bit for each triangle of a patch
+    fields: Sequence[Field]
+    corners: np.ndarray
+    places: np.ndarray
+    lengths: tuple[float, float, float]
+    search_interval: int
+    order: np.ndarray
+    patch_starts: np.ndarray
+    patches_may_meet: np.ndarray
+    non_adjacent: np.ndarray
 
     def emit(self, handle, api) -> None:
-        """Write it down."""
+        """Record the call of the library that builds the stage."""
         ids = tuple(field.id for field in self.fields)
-        limits = (self.chunk, len(self.starts) - 1, PATCH)
+        limits = (self.search_interval, len(self.patch_starts) - 1, PATCH_TRIANGLES)
         sizes = self.corners.shape[1], len(self.places)
         lengths = np.array(self.lengths, np.float64)
-        search = (np.ascontiguousarray(a) for a in (self.order, self.starts, self.meet, self.apart))
+        patches = (self.order, self.patch_starts, self.patches_may_meet, self.non_adjacent)
+        search = (np.ascontiguousarray(a) for a in patches)
         corners, places = np.ascontiguousarray(self.corners), np.ascontiguousarray(self.places)
-        api("contact")(handle, ids, len(ids), corners, sizes[0], places, sizes[1], lengths, limits, *search)
+        api("contact_search")(handle, ids, len(ids), corners, sizes[0], places, sizes[1], lengths, limits, *search)
 
 
-class PerMass(NamedTuple):
-    """See ``Program.per_mass``."""
+class GridVelocity(NamedTuple):
+    """Division of the nodes' momentum by their mass; see ``Program.grid_velocity``.
+
+    Attributes:
+        mass: field of the nodes with their mass [kg].
+        momentum: field of the nodes that is divided.
+        velocity: field of the nodes for the quotient.
+        min_mass: mass [kg] below which a node has no velocity.
+    """
 
     mass: Field
-    given: Field
-    out: Field
-    least: float
+    momentum: Field
+    velocity: Field
+    min_mass: float
 
     def emit(self, handle, api) -> None:
-        """Write it down."""
-        api("per_mass")(handle, self.mass.id, self.given.id, self.out.id, self.least)
+        """Record the call of the library that builds the stage."""
+        api("grid_velocity")(handle, self.mass.id, self.momentum.id, self.velocity.id, self.min_mass)
 
 
 class PointTables(NamedTuple):
-    """Points on triangles, in the order of these."""
+    """Tables of sample points on triangles, in the order of the triangles.
 
-    corners: int  # table [3, E] of vertices
-    starts: int  # table [E + 1] of the first points
+    Attributes:
+        corners: number of the table [3, E] of vertices.
+        starts: number of the table [E + 1] of each triangle's first point.
+        triangles: E.
+    """
+
+    corners: int
+    starts: int
     triangles: int
 
 
-class Sieve(NamedTuple):
-    """See ``Program.sieve``."""
+class PointBroadPhase(NamedTuple):
+    """List of the sample points that may touch a body; see ``Program.broad_phase``.
+
+    Attributes:
+        number: of the list.
+        x: [V, 3] positions [m].
+        approach: [V, 2] distance to the body [m] and speed relative to it [m/s].
+        dt: substep [s].
+        points: tables of the points.
+        lipschitz: Lipschitz constant of the body's distance function.
+    """
 
     number: int
     x: Field
-    reach: Field
+    approach: Field
     dt: Field
     points: PointTables
-    steep: float
+    lipschitz: float
 
     def emit(self, handle, api) -> None:
-        """Write it down."""
-        fields = (self.x.id, self.reach.id, self.dt.id)
-        api("sieve")(handle, self.number, *fields, *self.points, self.steep)
+        """Record the call of the library that builds the stage."""
+        fields = (self.x.id, self.approach.id, self.dt.id)
+        api("broad_phase")(handle, self.number, *fields, *self.points, self.lipschitz)
 
 
 class Stencil(NamedTuple):
-    """See ``Program.stencil``."""
+    """Linear operator on vertices; see ``Program.stencil``.
+
+    Attributes:
+        table: number of the table of neighbours.
+        weight: weights of the neighbours.
+        x: [V, 3] argument, or result of the transposed form.
+        y: [V, 3 count] result, or argument of the transposed form.
+        form: plain, transposed or symmetric.
+    """
 
     table: int
     weight: Field
     x: Field
     y: Field
-    shape: Shape
+    form: StencilForm
 
     def emit(self, handle, api) -> None:
-        """Write it down."""
-        api("stencil")(handle, self.table, self.weight.id, self.x.id, self.y.id, int(self.shape))
+        """Record the call of the library that builds the stage."""
+        api("stencil")(handle, self.table, self.weight.id, self.x.id, self.y.id, int(self.form))

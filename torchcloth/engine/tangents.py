@@ -1,4 +1,4 @@
-"""The engine's tangents: derivatives in many directions at once, carried beside the values."""
+"""The engine's tangents: derivatives along many directions at once, computed together with the values."""
 
 from __future__ import annotations
 
@@ -7,76 +7,89 @@ from collections.abc import Callable, Mapping
 import torch
 from torch import Tensor
 
-from ..boundaries import Drive
+from ..boundaries import PrescribedMotion
 from ..dynamics.forces import Impulses
 from ..dynamics.model import Model
 from ..types import ClothState
 from . import conversion
 from .fields import Field
-from .fused import Fused
+from .fused import FusedEngine
 from .lowering import lower
 from .operators import ops
 
 Coefficients = dict[Field, Tensor]
-Within = Callable[[Callable[[Model], Coefficients]], Coefficients]
+TangentsOf = Callable[[Callable[[Model], Coefficients]], Coefficients]
 
 
 class FusedTangents:
     """A model on the engine, with its derivatives along K directions.
 
     Args:
-        fused: without parts in torch.
-        within: gives the tangents [K, ...] of what a function makes of the model, where there are any.
+        fused: the engine, without parts in torch.
+        tangents_of: returns the tangents [K, ...] of what a function makes of the model, where there are any.
         count: K.
     """
 
-    def __init__(self, fused: Fused, within: Within, count: int) -> None:
-        self.fused, self.within, self.count = fused, within, count
-        self._known: dict[Field, Tensor] | None = None
+    def __init__(self, fused: FusedEngine, tangents_of: TangentsOf, count: int) -> None:
+        self.fused, self.tangents_of, self.count = fused, tangents_of, count
+        self._coefficient_tangents: dict[Field, Tensor] | None = None
 
     def rollout(
         self,
         state: ClothState,
-        lost: Tensor | None,
-        moved: ClothState,
+        compensation: Tensor | None,
+        state_tangent: ClothState,
         dt: float,
-        drives: Mapping[str, Drive],
-        driven: Mapping[str, Drive],
+        prescribed: Mapping[str, PrescribedMotion],
+        prescribed_tangents: Mapping[str, PrescribedMotion],
         substeps: int,
     ) -> tuple[ClothState, Tensor | None, ClothState, Impulses, Impulses]:
-        """(state, what is lost, tangents of the state [K, ...], impulses, their tangents) after the substeps.
+        """Run substeps with tangents.
 
-        ``driven``: drives' tangents; ``lost``: see ``functional.stretch``.
+        Args:
+            state: at the start.
+            compensation: rounding error of the positions, as for ``dynamics.substep.rollout_segment``.
+            state_tangent: [K, ...] of the state.
+            dt: substep [s].
+            prescribed: motions by boundary.
+            prescribed_tangents: their tangents, by boundary.
+            substeps: how many.
+
+        Returns:
+            State, compensation, tangents of the state [K, ...], impulses and their tangents after the substeps.
         """
-        low, batch = self.fused.low, state.x.shape[:-2]
-        program = low.program
-        given = self.fused.job(state, torch.full((substeps,), dt, dtype=torch.float64), drives, lost).inputs
-        dots = conversion.state_inputs(low, moved) | self._inputs(state, drives)
-        if driven:
-            dots |= {f: t for f, t in conversion.drive_inputs(low, driven).items() if f.comps > 1}  # not the flags
-        behind = conversion.flat(low, {f: t.movedim(0, -3) for f, t in dots.items()}, batch, behind=3)
-        fields = [f for f in program.inputs if f in behind]
+        builder, batch = self.fused.builder, state.x.shape[:-2]
+        program = builder.program
+        steps = torch.full((substeps,), dt, dtype=torch.float64)
+        inputs = self.fused.job(state, steps, prescribed, compensation).inputs
+        tangents = conversion.state_inputs(builder, state_tangent) | self._coefficients(state, prescribed)
+        if prescribed_tangents:
+            motions = conversion.prescribed_inputs(builder, prescribed_tangents)
+            tangents |= {f: t for f, t in motions.items() if f.comps > 1}  # not of the flags
+        leading = {f: t.movedim(0, -3) for f, t in tangents.items()}
+        flat = conversion.flatten_batch(builder, leading, batch, trailing=3)
+        fields = [f for f in program.inputs if f in flat]
         places = [program.inputs.index(f) for f in fields]
-        inputs, tangents = [given[f] for f in program.inputs], [behind[f] for f in fields]
-        results = ops.rollout_tangent(program.number, substeps, inputs, tangents, places)
+        values, moved = [inputs[f] for f in program.inputs], [flat[f] for f in fields]
+        results = ops.rollout_tangent(program.number, substeps, values, moved, places)
         half = len(program.outputs)
-        values = dict(zip(program.outputs, results[:half], strict=True))
-        after, lost, impulses = conversion.outcome(low, state, values, batch)
-        along = {f: t.movedim(1, 0) for f, t in zip(program.outputs, results[half:], strict=True)}
+        outputs = dict(zip(program.outputs, results[:half], strict=True))
+        after, compensation, impulses = conversion.unflatten_results(builder, state, outputs, batch)
+        along = {f: t.movedim(1, 0).flatten(0, 1) for f, t in zip(program.outputs, results[half:], strict=True)}
         shape = torch.Size((self.count, *batch))
-        moved, _, shift = conversion.outcome(low, moved, {f: t.flatten(0, 1) for f, t in along.items()}, shape)
-        return after, lost, moved, impulses, shift
+        state_tangent, _, impulse_tangents = conversion.unflatten_results(builder, state_tangent, along, shape)
+        return after, compensation, state_tangent, impulses, impulse_tangents
 
-    def _inputs(self, state: ClothState, drives: Mapping[str, Drive]) -> dict[Field, Tensor]:
+    def _coefficients(self, state: ClothState, prescribed: Mapping[str, PrescribedMotion]) -> dict[Field, Tensor]:
         """Tangents [K, ..., rows, comps] of the coefficients that have any."""
-        if self._known is None:
-            own = self.fused
+        if self._coefficient_tangents is None:
+            engine = self.fused
 
             def inputs(model: Model) -> Coefficients:
-                low = lower(model._replace(stages=own.model.stages), state, drives)
-                if low.program.fields != own.low.program.fields:
+                builder = lower(model._replace(stages=engine.model.stages), state, prescribed)
+                if builder.program.fields != engine.builder.program.fields:
                     raise RuntimeError("along the directions, the parts make another program")
-                return low.inputs
+                return builder.inputs
 
-            self._known = self.within(inputs)
-        return self._known
+            self._coefficient_tangents = self.tangents_of(inputs)
+        return self._coefficient_tangents

@@ -1,4 +1,4 @@
-// Which place on which triangle is nearest to a point: the search of losses/nearest.py.
+// The place on a triangle of a mesh that is nearest to a point.
 #pragma once
 
 #include <algorithm>
@@ -12,7 +12,7 @@
 namespace tc {
 
 template <class R>
-struct Place {
+struct SurfacePoint {
     R weights[3];  // barycentric coordinates
     R squared;     // distance
 };
@@ -39,8 +39,8 @@ struct Nearest {
         for (int64_t f = count; f < int64_t(packs) * L; f++) radius[f / L].v[f % L] = std::numeric_limits<R>::infinity();
     }
 
-    // The first of the nearest; -1: of a point or triangles that are not finite.
-    int64_t find(const R* at, Place<R>& found) {
+    // The first of the nearest triangles; -1 if the point or the triangles are not finite.
+    int64_t find(const R* at, SurfacePoint<R>& result) {
         constexpr int L = LANES<R>;
         const Vec<R> point{at[0], at[1], at[2]};
         Wide<R> least{double(std::numeric_limits<R>::max())};
@@ -54,36 +54,36 @@ struct Nearest {
         for (int i = 1; i < L; i++) bound = std::min(bound, least[i]);
         bound *= 1 + 16 * std::numeric_limits<R>::epsilon();
         int64_t first = -1;
-        found.squared = std::numeric_limits<R>::infinity();
+        result.squared = std::numeric_limits<R>::infinity();
         for (int64_t f = 0; f < count; f++) {
             if (!(distance[f / L][f % L] - radius[f / L][f % L] <= bound)) continue;
-            const Place<R> here = on_triangle(point, f);
-            if (here.squared < found.squared) found = here, first = f;
+            const SurfacePoint<R> candidate = on_triangle(point, f);
+            if (candidate.squared < result.squared) result = candidate, first = f;
         }
         return first;
     }
 
-    // Inside, or on one of the edges.
-    Place<R> on_triangle(Vec<R> point, int64_t f) const {
+    // The nearest place of one triangle: inside, or on one of its edges.
+    SurfacePoint<R> on_triangle(Vec<R> point, int64_t f) const {
         const Vec<R> a = corner(f, 0), e1 = corner(f, 1) - a, e2 = corner(f, 2) - a, offset = point - a;
         const Vec<R> normal = cross(e1, e2);
         const R square = dot(normal, normal);
         const R v = dot(cross(offset, e2), normal) / square, w = dot(cross(e1, offset), normal) / square;
         if (1 - v - w >= 0 && v >= 0 && w >= 0) return place(point, f, 1 - v - w, v, w);
-        Place<R> best{{}, std::numeric_limits<R>::infinity()};
+        SurfacePoint<R> best{{}, std::numeric_limits<R>::infinity()};
         for (int from = 0; from < 3; from++) {
             const int to = (from + 1) % 3;
             const Vec<R> start = corner(f, from), edge = corner(f, to) - start;
             const R t = std::clamp(dot(point - start, edge) / dot(edge, edge), R(0), R(1));
             R weights[3] = {};
             weights[from] = 1 - t, weights[to] = t;
-            const Place<R> here = place(point, f, weights[0], weights[1], weights[2]);
-            if (here.squared < best.squared) best = here;
+            const SurfacePoint<R> candidate = place(point, f, weights[0], weights[1], weights[2]);
+            if (candidate.squared < best.squared) best = candidate;
         }
         return best;
     }
 
-    Place<R> place(Vec<R> point, int64_t f, R a, R b, R c) const {
+    SurfacePoint<R> place(Vec<R> point, int64_t f, R a, R b, R c) const {
         const Vec<R> p = corner(f, 0), q = corner(f, 1), r = corner(f, 2);
         const Vec<R> away{point.x - (a * p.x + b * q.x + c * r.x), point.y - (a * p.y + b * q.y + c * r.y),
                           point.z - (a * p.z + b * q.z + c * r.z)};
@@ -99,9 +99,9 @@ template <class R>
 void nearest(const R* points, int64_t many, const R* corners, int64_t count, int64_t* face, R* weights) {
     Nearest<R> search(corners, count);
     for (int64_t k = 0; k < many; k++) {
-        Place<R> found;
-        face[k] = search.find(points + 3 * k, found);
-        std::copy(found.weights, found.weights + 3, weights + 3 * k);
+        SurfacePoint<R> result;
+        face[k] = search.find(points + 3 * k, result);
+        std::copy(result.weights, result.weights + 3, weights + 3 * k);
     }
 }
 

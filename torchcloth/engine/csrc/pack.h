@@ -1,8 +1,11 @@
-// L numbers side by side: the arithmetic of all kernels. GCC and Clang turn it into whatever the processor has.
+// Packs of L numbers, and their arithmetic, which all kernels use. GCC and Clang compile it to the processor's SIMD
+// instructions.
 #pragma once
 
 #include <cmath>
 #include <cstdint>
+
+#include "enums.h"
 
 namespace tc {
 
@@ -19,7 +22,7 @@ struct Pack {
     R operator[](int lane) const { return v[lane]; }
 };
 
-// What is wider than a register is two halves: as one vector, the compiler would take it through memory.
+// A pack wider than a register has two halves. As one vector, the compiler would pass it through memory.
 template <class R, int L>
 constexpr bool HALVED = L * int(sizeof(R)) > WIDTH;
 template <class R, int L>
@@ -63,7 +66,7 @@ TC_BINARY(/)
 template <class R, int L>
 inline Pack<R, L> operator-(Pack<R, L> a) { return Pack<R, L>(-a.v); }
 
-// Comparisons give 1 or 0; `select` takes the first where that is not 0.
+// Comparisons return 1 or 0; `select` returns the first argument after the condition where that is not 0.
 template <class R, int L>
 inline Pack<R, L> less(Pack<R, L> a, Pack<R, L> b) { return Pack<R, L>(a.v < b.v ? Pack<R, L>(1.0).v : Pack<R, L>(0.0).v); }
 template <class R, int L>

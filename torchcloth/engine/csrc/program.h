@@ -1,4 +1,4 @@
-// What a substep is made of: fields, index tables, and the stages that read and write them.
+// What a substep consists of: fields, index tables, and the stages that read and write them.
 #pragma once
 
 #include <algorithm>
@@ -9,39 +9,34 @@
 #include <string>
 #include <vector>
 
-#include "rows.h"
+#include "row_layout.h"
 #include "tape.h"
-#include "team.h"
+#include "thread_team.h"
 
 namespace tc {
 
-// constant: of the mesh. parameter: an input with a derivative. state: at the start of the substep; its `next` at the
-// end. temporary: within a substep; a kept one is recorded, because the reverse sweep reads it. drive: one row per
-// substep. sum: added up over the substeps of a frame. nodes, points: of contact, which sees to their memory; what loops
-// over points tell each other lies there as in registers, pack by pack.
-enum class Kind : int { constant, parameter, state, next, temporary, kept, drive, sum, nodes, points };
-
+// Rows of numbers. Weights of a stencil lie by groups of four vertices, so that a stencil reads them one after the
+// other.
 struct Field {
-    Kind kind;
+    FieldKind kind;
     int rows, comps;
-    int padded;        // rows, rounded up to whole packs
-    int pitch;         // numbers between rows, see rows.h
-    int offset = -1;   // of state and kept fields in a record
-    bool raw = false;  // weights of a stencil [count, near, vertices]
-    int near = 0, vertices = 0;
-    size_t size() const { return raw ? size_t(rows) / vertices * groups() * 4 : size_t(padded) * pitch; }
+    int padded;                      // rows, rounded up to whole packs
+    int pitch;                       // numbers between rows, see row_layout.h
+    int offset = -1;                 // of state and recorded fields in a record
+    bool is_stencil_weight = false;  // rows are [count, neighbours, vertices]
+    int neighbours = 0, vertices = 0;
+    size_t size() const { return is_stencil_weight ? size_t(rows) / vertices * groups() * 4 : size_t(padded) * pitch; }
 
-    // Weights lie by groups of four vertices, so that a stencil reads them one after the other.
     int groups() const { return (vertices + 3) / 4; }
     size_t place(size_t row) const {
-        if (!raw) return row * pitch;
-        const size_t v = row % vertices, n = row / vertices % near, c = row / vertices / near;
-        return ((c * groups() + v / 4) * near + n) * 4 + v % 4;
+        if (!is_stencil_weight) return row * pitch;
+        const size_t v = row % vertices, n = row / vertices % neighbours, c = row / vertices / neighbours;
+        return ((c * groups() + v / 4) * neighbours + n) * 4 + v % 4;
     }
 };
 
 template <class R>
-struct Buffer {  // aligned, zero at first
+struct Buffer {  // aligned memory, zero at first
     R* data = nullptr;
     size_t size = 0;
     Buffer() = default;
@@ -62,78 +57,78 @@ struct Buffer {  // aligned, zero at first
     void clear() { std::memset(static_cast<void*>(data), 0, size * sizeof(R)); }
 };
 
-// Items that a sieve has found, padded to whole packs.
-struct List {
+// Points that a broad phase lists, padded to whole packs.
+struct PointList {
     std::vector<int> items;
     int count = 0;
 };
 
-// Inputs in the order in which a loop needs them: [packs, components, lanes].
+// Inputs that do not change during a run, in the order in which a loop needs them: [packs, components, lanes].
 template <class R>
-struct Fixed {
+struct LoopInvariant {
     Buffer<R> packs;
-    int made = -1;  // for which lists of contact
+    int version = -1;  // Scene::contact_version for which they were gathered
 };
 
-// Rows that contact lists, in the order of engine/lowerings/contact.py: of points, of those woken and those asleep, from the
-// seventh on anew at every substep. OWN_ROW: no two points have the same there.
-enum Listed { POINTS_LIST, OWN_ROW = 4, WOKEN_LIST = 7, ASLEEP_LIST = 13, LISTS = 19 };
-
 template <class R>
-struct Layers;  // contact.h
+struct ContactState;  // contact.h
 
 // Where a thread finds the fields, and its registers.
 template <class R>
-struct View {
+struct ThreadView {
     R *const *value, *const *bar, *const *dot;
     Wide<R>*regs, *bars;
-    R* dots;         // [register][lane][direction]
-    int* picked;     // rows of the items of a pack, by table of the loop
+    R* dots;      // [register][lane][direction]
+    int* picked;  // rows of the items of a pack, by table of the loop
 };
 
-// What a thread beside the first one needs: registers, and memory for what several add to at once.
+// Memory of a thread other than the first: registers, and private sums for rows that several threads add to.
 template <class R>
-struct Desk {
-    struct Share {
+struct ThreadScratch {
+    struct Accumulator {
         Buffer<R> memory;
-        R* to = nullptr;
-        size_t low = 0, high = 0;  // numbers that it may have added to
+        R* target = nullptr;       // where the sums belong
+        size_t low = 0, high = 0;  // numbers that the thread may have added to
     };
     std::vector<R*> value, bar, dot;
-    std::vector<Share> values, bars, dots;  // by field
-    std::vector<Share*> used;               // in the present loop
-    Buffer<Wide<R>> own_regs, own_bars;
-    Buffer<R> own_dots;
+    std::vector<Accumulator> values, bars, dots;  // by field
+    std::vector<Accumulator*> used;               // in the present loop
+    Buffer<Wide<R>> regs_memory, bars_memory;
+    Buffer<R> dots_memory;
     std::vector<int> picked;
-    View<R> view() { return {value.data(), bar.data(), dot.data(), own_regs.data, own_bars.data, own_dots.data, picked.data()}; }
+    ThreadView<R> view() {
+        return {value.data(), bar.data(), dot.data(), regs_memory.data, bars_memory.data, dots_memory.data, picked.data()};
+    }
 };
 
-// One simulated scene, or one scene with some directions: everything that changes.
+// All that changes in one simulated scene, or in one scene with some directions. As in texts on automatic
+// differentiation, `bar` is an adjoint and `dot` is a tangent.
 template <class R>
 struct Scene {
     std::vector<R*> value, bar, dot;  // by field; null where there is none
     Buffer<Wide<R>> regs, bars;
     Buffer<R> dots;
-    int directions = 0;  // in it
+    int directions = 0;  // of the tangents
     std::vector<int> picked;
-    View<R> view() { return {value.data(), bar.data(), dot.data(), regs.data, bars.data, dots.data, picked.data()}; }
-    Team* team = nullptr;
-    double worth = 0;                 // operations of a substep for which another thread is worth while
-    std::vector<Desk<R>> desks;       // of the team's members beside the first
-    std::vector<List> lists;          // by sieve
-    // What contact between layers decides anew at every substep: how many items some loops have, and which rows.
-    std::vector<int> counts;
-    std::vector<const int*> rows;
-    std::shared_ptr<Layers<R>> layers;
-    int parts = 1, point_parts = 1;  // into which rows, and points of contact, are divided among threads
-    std::vector<Fixed<R>> fixed;
-    int lists_made = 0;  // how often contact listed other points
+    ThreadView<R> view() {
+        return {value.data(), bar.data(), dot.data(), regs.data, bars.data, dots.data, picked.data()};
+    }
+    ThreadTeam* team = nullptr;
+    double min_ops_per_thread = 0;          // operations of a substep that make another thread worth while
+    std::vector<ThreadScratch<R>> scratch;  // of the team's threads other than the first
+    std::vector<PointList> point_lists;     // by broad phase
+    std::vector<int> contact_counts;        // items of the loops over contact points, at this substep
+    std::vector<const int*> contact_rows;   // their tables of rows
+    std::shared_ptr<ContactState<R>> contact;
+    int parts = 1, point_parts = 1;  // into which rows, and contact points, are divided among threads
+    std::vector<LoopInvariant<R>> invariants;
+    int contact_version = 0;  // how often the list of contact points has changed
     int64_t substep = 0, substeps = 0;
-    int32_t* masks = nullptr;  // triangles that take part, a bit each: [substeps, words]
-    bool knows = false;        // masks are there already
+    int32_t* masks = nullptr;  // active triangles, a bit each: [substeps, words]
+    bool has_masks = false;    // the masks exist already
 };
 
-// f(first row, behind the last one) for the rows of every thread.
+// Calls f(first row, behind the last one) for the rows of every thread.
 template <class R, class F>
 void over_rows(const Scene<R>& s, int rows, F f) {
     if (s.parts == 1) return f(0, rows);
@@ -143,51 +138,51 @@ void over_rows(const Scene<R>& s, int rows, F f) {
 template <class R>
 struct Stage {
     virtual ~Stage() = default;
-    virtual void ready() {}  // all its instructions are there
-    virtual double cost(const Scene<R>&) const { return 0; }  // operations on numbers, about
+    virtual void finish() {}                                  // called when all its instructions are there
+    virtual double cost(const Scene<R>&) const { return 0; }  // approximate operations on numbers
     virtual void forward(Scene<R>& s) const = 0;
     virtual void tangent(Scene<R>& s) const = 0;
-    virtual void reverse(Scene<R>& s) const = 0;  // values of all that it reads are there
-    virtual void replay(Scene<R>& s) const { forward(s); }  // writes only what is not recorded
-    bool again = false;  // something that it writes is not recorded: the reverse sweep replays it
+    virtual void reverse(Scene<R>& s) const = 0;            // values of all fields that it reads are there
+    virtual void replay(Scene<R>& s) const { forward(s); }  // writes only numbers that are not recorded
+    bool is_replayed = false;  // the reverse sweep replays it, because something that it writes is not recorded
 };
 
 template <class R>
 struct Program {
     std::vector<Field> fields;
-    std::vector<Buffer<R>> constants;  // by field
-    std::vector<int> next;  // by field: of a state, where it goes; else -1
+    std::vector<Buffer<R>> constants;      // by field
+    std::vector<int> next;                 // by field: of a state, the field at the end of the substep; else -1
     std::vector<std::vector<int>> tables;  // padded to whole packs
     std::vector<std::unique_ptr<Stage<R>>> stages;
-    int registers = 0, lists = 0, fixed = 0;
-    int counts = 0, rows = 0, words = 0;  // sizes of what Scene has for contact
-    size_t state_size = 0, record_size = 0;  // numbers
-    mutable Habit habits[3];  // by mode; guard them
-    mutable std::mutex guard;
+    int registers = 0, point_lists = 0, invariants = 0;
+    int contact_counts = 0, contact_tables = 0, mask_words = 0;  // sizes of the scene's memory for contact
+    size_t state_size = 0, record_size = 0;                      // numbers
+    mutable ParallelPolicy policies[3];                          // by run mode
+    mutable std::mutex policy_mutex;
 
-    int field(Kind kind, int rows, int comps, int near = 0, int vertices = 0) {
-        const bool raw = near > 0, plain = raw || kind == Kind::drive;
-        fields.push_back({kind, rows, comps, plain ? rows : round_up(rows, LANES<float>), plain ? comps : pitch_of(comps), -1,
-                          raw, near, vertices});
+    int field(FieldKind kind, int rows, int comps, int neighbours = 0, int vertices = 0) {
+        const bool is_weight = neighbours > 0, is_plain = is_weight || kind == FieldKind::per_substep;
+        fields.push_back({kind, rows, comps, is_plain ? rows : round_up(rows, LANES<float>),
+                          is_plain ? comps : pitch_of(comps), -1, is_weight, neighbours, vertices});
         next.push_back(-1);
         constants.emplace_back();
         return int(fields.size()) - 1;
     }
-    // As many as are worth it.
+    // Threads that are worth while for a scene.
     int parts(const Scene<R>& s) const {
         if (s.team == nullptr) return 1;
         double sum = 0;
         for (const auto& stage : stages) sum += stage->cost(s);
-        return int(std::clamp(sum / s.worth, 1.0, double(s.team->size)));
+        return int(std::clamp(sum / s.min_ops_per_thread, 1.0, double(s.team->size)));
     }
     void lay_out() {  // states first: the record of a coarse checkpoint is the start of a full one
         record_size = 0;
-        for (Kind kind : {Kind::state, Kind::kept}) {
+        for (FieldKind kind : {FieldKind::state, FieldKind::recorded}) {
             for (Field& f : fields)
                 if (f.kind == kind) f.offset = int(record_size), record_size += round_up(int(f.size()), LANES<float>);
-            if (kind == Kind::state) state_size = record_size;
+            if (kind == FieldKind::state) state_size = record_size;
         }
-        for (auto& stage : stages) stage->ready();
+        for (auto& stage : stages) stage->finish();
     }
 };
 

@@ -1,4 +1,4 @@
-// Vectors of three numbers of any kind, and readers that turn a kernel's flat arguments into them.
+// Vectors of three numbers of any type, and readers that turn a kernel's flat arguments into them.
 #pragma once
 
 #include "tape.h"
@@ -31,7 +31,7 @@ constexpr Vec<T> cross(Vec<T> a, Vec<T> b) {
 template <class T>
 constexpr Vec<T> select(T c, Vec<T> a, Vec<T> b) { return {select(c, a.x, b.x), select(c, a.y, b.y), select(c, a.z, b.z)}; }
 
-// Length; value and derivative 0 at 0.
+// Square root with value and derivative 0 at 0.
 template <class T>
 constexpr T safe_sqrt(T squared) {
     const T positive = less(0.0, squared);
@@ -80,8 +80,8 @@ struct Pose {  // p -> R p + t
     Vec<T> t;
 };
 
-// Where a rigid motion takes x, less x. A small turn hardly shows beside the ones of its matrix, so it is taken from the
-// other entries: with w = sin(angle) axis, (R - 1) x = w x x + (w (w . x) - |w|^2 x) / (1 + cos(angle)).
+// Displacement of x by a rigid motion. A small rotation hardly changes the ones of its matrix, so it is computed from
+// the other entries. With w = sin(angle) axis, (R - 1) x = w x x + (w (w . x) - |w|^2 x) / (1 + cos(angle)).
 template <class T>
 constexpr Vec<T> displacement(Pose<T> m, Vec<T> x) {
     const auto& R = m.R;
@@ -91,7 +91,7 @@ constexpr Vec<T> displacement(Pose<T> m, Vec<T> x) {
 }
 
 template <class T>
-struct Read {
+struct Reader {
     const T* at;
     constexpr T number() { return *at++; }
     constexpr Vec<T> vec() { const T* p = at; at += 3; return {p[0], p[1], p[2]}; }
@@ -105,14 +105,14 @@ struct Read {
 };
 
 template <class T>
-struct Write {
+struct Writer {
     T* at;
     constexpr void number(T a) { *at++ = a; }
     constexpr void vec(Vec<T> a) { *at++ = a.x; *at++ = a.y; *at++ = a.z; }
     constexpr void symmetric(Symmetric<T> m) { for (T a : {m.xx, m.xy, m.xz, m.yy, m.yz, m.zz}) *at++ = a; }
 };
 
-// Bit mask of inputs that never vary: constants of the mesh, the step. Their derivatives are not computed.
-constexpr unsigned long long bits(int first, int count) { return ((1ull << count) - 1) << first; }
+// Bit mask of inputs that never vary, such as constants of the mesh and dt. Their derivatives are not computed.
+constexpr unsigned long long input_bits(int first, int count) { return ((1ull << count) - 1) << first; }
 
 }  // namespace tc

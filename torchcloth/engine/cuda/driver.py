@@ -1,4 +1,4 @@
-"""NVIDIA's run-time compiler and driver, by their C interfaces: both come with torch and the device."""
+"""NVIDIA's run-time compiler (NVRTC) and driver, by their C interfaces: both come with torch and the device."""
 
 from __future__ import annotations
 
@@ -12,65 +12,65 @@ from pathlib import Path
 
 import torch
 
-from ..._utils.files import atomically
+from ..._utils.files import write_atomically
 from .. import building
-from ..building import Unbuilt
+from ..building import EngineUnavailable
 
-FLAGS = ("--std=c++17", "--fmad=true", "--extra-device-vectorization")
-OUT_OF_MEMORY = 2
-UNFIT = (200, 209, 218, 222, 300)  # machine code that is damaged, or for another device or driver
-LOG = 2000  # characters of what the compiler says
+NVRTC_FLAGS = ("--std=c++17", "--fmad=true", "--extra-device-vectorization")
+OUT_OF_MEMORY_CODE = 2
+UNUSABLE_MODULE_CODES = (200, 209, 218, 222, 300)  # machine code that is damaged, or for another device or driver
+MAX_LOG_CHARACTERS = 2000
 
 
 def _options(threads: int, device: torch.device) -> tuple[str, ...]:
     major, minor = torch.cuda.get_device_capability(device)
-    return (*FLAGS, f"--gpu-architecture=sm_{major}{minor}", f"-DTHREADS={threads}")
+    return (*NVRTC_FLAGS, f"--gpu-architecture=sm_{major}{minor}", f"-DTHREADS={threads}")
 
 
-def _name(text: str, options: Sequence[str]) -> str:
-    """Of a file with the machine code."""
-    known = hashlib.sha256("\0".join([text, *options, str(torch.version.cuda)]).encode()).hexdigest()[:20]
-    return f"program-{known}.cubin"
+def _file_name(text: str, options: Sequence[str]) -> str:
+    digest = hashlib.sha256("\0".join([text, *options, str(torch.version.cuda)]).encode()).hexdigest()[:20]
+    return f"program-{digest}.cubin"
 
 
-def _keep(name: str, code: bytes) -> None:
-    for folder in building.own_folders():
-        with suppress(OSError), atomically(folder / name) as file:
+def _store(name: str, code: bytes) -> None:
+    for folder in building.private_cache_folders():
+        with suppress(OSError), write_atomically(folder / name) as file:
             file.write_bytes(code)
             return
 
 
-class Kernels:
-    """A text, compiled for blocks of so many threads on a device.
+class DeviceKernels:
+    """The kernels of a text, compiled for blocks of so many threads on a device.
 
     Raises:
-        Unbuilt: it cannot be.
+        EngineUnavailable: the text cannot be compiled or loaded.
     """
 
     def __init__(self, text: str, threads: int, device: torch.device) -> None:
         self.threads, self._device = threads, device
         self._functions: dict[str, ctypes.c_void_p] = {}
         options = _options(threads, device)
-        name = _name(text, options)
-        module, known = None, building.cached(name)
+        name = _file_name(text, options)
+        module, file = None, building.cached(name)
         with suppress(OSError):
-            module = None if known is None else self._loaded(known.read_bytes())
-        if module is None:  # nothing is there, or what does not load
+            module = None if file is None else self._load(file.read_bytes())
+        if module is None:  # there is no file, or its code does not load
             code = _compile(text, options)
-            module = self._loaded(code)
+            module = self._load(code)
             if module is None:
-                raise Unbuilt("the driver does not load what NVRTC compiles", "update NVIDIA's driver, or torch")
-            _keep(name, code)
+                remedy = "update NVIDIA's driver, or torch"
+                raise EngineUnavailable("the driver does not load what NVRTC compiles", remedy)
+            _store(name, code)
         self._module = module
 
-    def _loaded(self, code: bytes) -> ctypes.c_void_p | None:
+    def _load(self, code: bytes) -> ctypes.c_void_p | None:
         module = ctypes.c_void_p()
         with torch.cuda.device(self._device):
-            torch.cuda.current_stream().synchronize()  # then there is a context
-            answer = _again(lambda: _driver().cuModuleLoadData(ctypes.byref(module), code))
-            if answer in UNFIT:
+            torch.cuda.current_stream().synchronize()  # makes the context
+            status = _retry_when_out_of_memory(lambda: _driver().cuModuleLoadData(ctypes.byref(module), code))
+            if status in UNUSABLE_MODULE_CODES:
                 return None
-            _check(answer)
+            _check(status)
             return module
 
     def launch(self, name: str, blocks: int, shared: int, arguments: Sequence[ctypes._SimpleCData]) -> None:
@@ -79,8 +79,11 @@ class Kernels:
         Args:
             name: of the kernel.
             blocks: how many.
-            shared: bytes of each.
+            shared: shared memory of each [bytes].
             arguments: pointers and counts.
+
+        Raises:
+            RuntimeError: the driver reports an error.
         """
         with torch.cuda.device(self._device):
             if name not in self._functions:
@@ -90,24 +93,25 @@ class Kernels:
             pointers = (ctypes.c_void_p * len(arguments))(*(ctypes.addressof(a) for a in arguments))
             stream = ctypes.c_void_p(torch.cuda.current_stream().cuda_stream)
             sizes = tuple(ctypes.c_uint(n) for n in (blocks, 1, 1, self.threads, 1, 1, shared))
-            given = (self._functions[name], *sizes, stream, pointers, None)
-            _check(_again(lambda: _driver().cuLaunchKernel(*given)))
+            launch_arguments = (self._functions[name], *sizes, stream, pointers, None)
+            _check(_retry_when_out_of_memory(lambda: _driver().cuLaunchKernel(*launch_arguments)))
 
 
 def _compile(text: str, options: Sequence[str]) -> bytes:
     nvrtc = _compiler()
     program = ctypes.c_void_p()
-    given = (ctypes.c_char_p * len(options))(*(o.encode() for o in options))
-    made = nvrtc.nvrtcCreateProgram(ctypes.byref(program), text.encode(), b"program.cu", 0, None, None)
-    if made:
-        raise Unbuilt(f"NVRTC: error {made}", "reinstall torch with CUDA")
+    flags = (ctypes.c_char_p * len(options))(*(o.encode() for o in options))
+    status = nvrtc.nvrtcCreateProgram(ctypes.byref(program), text.encode(), b"program.cu", 0, None, None)
+    if status:
+        raise EngineUnavailable(f"NVRTC: error {status}", "reinstall torch with CUDA")
     try:
-        failed, size = nvrtc.nvrtcCompileProgram(program, len(options), given), ctypes.c_size_t()
-        if failed:
+        status, size = nvrtc.nvrtcCompileProgram(program, len(options), flags), ctypes.c_size_t()
+        if status:
             nvrtc.nvrtcGetProgramLogSize(program, ctypes.byref(size))
             log = ctypes.create_string_buffer(size.value)
             nvrtc.nvrtcGetProgramLog(program, log)
-            raise Unbuilt(f"NVRTC: {log.value.decode()[:LOG]}", "report it, with torch's version and the device")
+            message = log.value.decode()[:MAX_LOG_CHARACTERS]
+            raise EngineUnavailable(f"NVRTC: {message}", "report it, with torch's version and the device")
         nvrtc.nvrtcGetCUBINSize(program, ctypes.byref(size))
         code = ctypes.create_string_buffer(size.value)
         nvrtc.nvrtcGetCUBIN(program, code)
@@ -117,29 +121,25 @@ def _compile(text: str, options: Sequence[str]) -> bytes:
 
 
 def status() -> str:
-    """Whether programs can be compiled for a device, in a line; compiles nothing."""
+    """Return a line that says whether programs can be compiled for a device; compile nothing."""
     try:
         _compiler()
         _driver()
-    except Unbuilt as miss:
-        return f"not available, graphs of the torch reference serve: {miss}; {miss.remedy}"
+    except EngineUnavailable as reason:
+        return f"not available, graphs of the torch reference serve: {reason}; {reason.remedy}"
     return "programs are compiled at first use"
 
 
 @cache
 def _compiler() -> ctypes.CDLL:
-    """torch's own NVRTC.
-
-    Raises:
-        Unbuilt: it is not there.
-    """
-    for name in _names():
+    """torch's own NVRTC."""
+    for name in _library_names():
         with suppress(OSError):
             return ctypes.CDLL(name)
-    raise Unbuilt("no libnvrtc", "install torch with CUDA, or CUDA's toolkit")
+    raise EngineUnavailable("no libnvrtc", "install torch with CUDA, or CUDA's toolkit")
 
 
-def _names() -> Iterator[str]:
+def _library_names() -> Iterator[str]:
     major = (torch.version.cuda or "").partition(".")[0]
     yield f"libnvrtc.so.{major}"  # torch may have loaded it
     for folder in (sysconfig.get_path("purelib"), Path(torch.__file__).parent.parent):
@@ -152,13 +152,13 @@ def _driver() -> ctypes.CDLL:
     try:
         return ctypes.CDLL("libcuda.so.1")
     except OSError as error:
-        raise Unbuilt(f"no CUDA driver: {error}", "install NVIDIA's driver") from error
+        raise EngineUnavailable(f"no CUDA driver: {error}", "install NVIDIA's driver") from error
 
 
-def _again(call: Callable[[], int]) -> int:
-    """The driver's answer; where memory is short, once more with what torch can spare."""
+def _retry_when_out_of_memory(call: Callable[[], int]) -> int:
+    """The driver's status; where memory is short, that of a second try with what torch can spare."""
     code = call()
-    if code != OUT_OF_MEMORY:
+    if code != OUT_OF_MEMORY_CODE:
         return code
     torch.cuda.empty_cache()
     return call()

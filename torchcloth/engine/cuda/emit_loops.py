@@ -3,260 +3,268 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
-from typing import TYPE_CHECKING
 
-from ..fields import Kind
-from ..loops import ADD, COLLECT, LOAD, OWN, PUT, SHARED, SHARES, SPREAD, VARYING, By
-from .emit_contact import ROW
+from ..enums import CONTACT_ROWS, ITEM_ROW, SINGLE_ROW, TRANSFER_SHARES, FieldKind, Opcode, TransferBasis
+from ..loops import LOOKUP_REGISTERS
+from .emit_contact import POINT_ROW_NUMBERS
 from .kernel_codegen import kernel
-from .program_ir import CORNERS, Call, Lookup, Loop, Move, Transfer
+from .layout import Layout
+from .program_ir import TRIANGLE_CORNERS, Call, Lookup, Loop, Move, Transfer
 
-if TYPE_CHECKING:
-    from .codegen import Source
+ACTIVE_CONDITIONS = ("h.some", "h.activated", "(h.step == h.all - 1)")  # by ``ContactCount``: whether a loop has items
+POINT_CONDITIONS = ("h.mask[t]", "h.mask[t] && !h.before[t]", "!h.mask[t]")  # whether it runs on triangle t's points
 
 
-class OfLoop:
-    """Functions of a loop."""
+class LoopEmitter:
+    """Functions of a loop.
 
-    def __init__(self, source: Source, stage: Loop, begins: set[int]) -> None:
-        self._source, self._stage, self._begins, self._fields = source, stage, begins, source.of.fields
-        self._rows: dict[int, int] = {}  # where in scratch those of points begin, forward (ADD) and back (LOAD)
+    Args:
+        layout: memory of the program.
+        stage: the loop.
+        first_written: fields that no earlier stage writes.
+    """
+
+    def __init__(self, layout: Layout, stage: Loop, first_written: set[int]) -> None:
+        self._layout, self._stage, self._first_written = layout, stage, first_written
+        self._fields = layout.fields
+        # where the rows of contact points begin in scratch memory, forward (ADD) and back (LOAD)
+        self._point_rows: dict[int, int] = {}
 
     def forward(self) -> Iterator[str]:
-        """Values."""
-        sums = [(m, c) for m in self._stage.moves(ADD) if m.table == SHARED for c in range(self._comps(m))]
+        """Yield the lines for values."""
+        sums = [(m, c) for m in self._stage.moves(Opcode.ADD) if m.table == SINGLE_ROW for c in range(self._comps(m))]
         shared = {(m.field, c): f"s{k}" for k, (m, c) in enumerate(sums)}
-        scratch = self._scratched(ADD)
-        yield from self._begun("f", scratch, shared)
+        scratch = self._scratch_places(Opcode.ADD)
+        yield from self._prologue("f", scratch, shared)
         for n, i in enumerate(self._stage.code):
-            if isinstance(i, Transfer) and i.code == SPREAD:
-                yield from self._given(i, [f"r{i.share + k}" for k in range(SHARES)], ADD)
+            if isinstance(i, Transfer) and i.code == Opcode.P2G:
+                yield from self._store_point_row(i, [f"r{i.shares + k}" for k in range(TRANSFER_SHARES)], Opcode.ADD)
                 continue
             if not isinstance(i, Move):
-                yield from self._computed(n, i)
+                yield from self._value_lines(n, i)
                 continue
             for c in range(self._comps(i)):
-                place, reg = f"f{i.field}[{self._place(i, c)}]", f"r{i.reg + c}"
-                if i.code == LOAD:
+                place, reg = f"f{i.field}[{self._element(i, c)}]", f"r{i.reg + c}"
+                if i.code == Opcode.LOAD:
                     yield f"    R {reg} = {place};"
-                elif i.code == PUT:
+                elif i.code == Opcode.STORE:
                     yield f"    {place} = {reg};"
-                elif i.table == SHARED:
+                elif i.table == SINGLE_ROW:
                     yield f"    {shared[i.field, c]} += {reg};"
                 elif i in scratch:
                     yield f"    {self._slot(scratch[i], c)} = {reg};"
                 else:
-                    begins = (
-                        i.field in self._begins and i.table == OWN and self._stage.items == self._fields[i.field].rows
-                    )
-                    yield f"    {place} {'=' if begins else '+='} {reg};"
+                    fills = i.table == ITEM_ROW and self._stage.items == self._fields[i.field].rows
+                    yield f"    {place} {'=' if fills and i.field in self._first_written else '+='} {reg};"
         yield "}"
         yield "SYNC();"
         for field, moves in self._by_field(scratch).items():
-            begins = "=" if field in self._begins and self._source.fills(self._stage, field) else "+="
-            yield from self._gathered(f"f{field}", moves, scratch, begins)
-        for i in self._stage.transfers(SPREAD):
-            begins = str(i.field in self._begins).lower()
-            yield f"gather(h.nodes, {_arms(i)}, scratch + {self._rows[ADD]}, h.f{i.field}, {begins});"
+            fills = field in self._first_written and self._layout.fills(self._stage, field)
+            yield from self._gather(f"f{field}", moves, scratch, "=" if fills else "+=")
+        for i in self._stage.transfers(Opcode.P2G):
+            begins = str(i.field in self._first_written).lower()
+            rows = self._point_rows[Opcode.ADD]
+            yield f"p2g(h.nodes, {_uses_arms(i)}, scratch + {rows}, h.f{i.field}, {begins});"
         if shared:
-            yield from self._reduced([(f"h.f{field}[{c}]", name) for (field, c), name in shared.items()])
+            yield from self._reduce([(f"h.f{field}[{c}]", name) for (field, c), name in shared.items()])
 
     def reverse(self) -> Iterator[str]:
-        """Adjoints."""
-        if self._stage.flat:
+        """Yield the lines for adjoints."""
+        if self._stage.no_derivative:
             return
-        scratch = self._scratched(LOAD)
-        loads = [m for m in self._stage.moves(LOAD) if self._is_active(m) and m.table == SHARED]
+        scratch = self._scratch_places(Opcode.LOAD)
+        loads = [m for m in self._stage.moves(Opcode.LOAD) if self._has_adjoint(m) and m.table == SINGLE_ROW]
         shared = {(m.field, c): f"s{k}_{c}" for k, m in enumerate(loads) for c in range(self._comps(m))}
-        yield from self._begun("fg", scratch, shared)
+        yield from self._prologue("fg", scratch, shared)
         for n, i in enumerate(self._stage.code):
-            if isinstance(i, Transfer) and i.code == SPREAD:
+            if isinstance(i, Transfer) and i.code == Opcode.P2G:
                 continue
             if not isinstance(i, Move):
-                yield from self._computed(n, i)
-            elif i.code == LOAD:
+                yield from self._value_lines(n, i)
+            elif i.code == Opcode.LOAD:
                 for c in range(self._comps(i)):
-                    yield f"    R r{i.reg + c} = f{i.field}[{self._place(i, c)}];"
-        registers = sorted(self._registers())
+                    yield f"    R r{i.reg + c} = f{i.field}[{self._element(i, c)}];"
+        registers = sorted(self._all_registers())
         yield f"    R {', '.join(f'b{reg} = R(0)' for reg in registers)};"
         for n in reversed(range(len(self._stage.code))):
             i = self._stage.code[n]
             if isinstance(i, Move):
-                yield from self._moved_back(i, scratch, shared)
+                yield from self._reverse_move(i, scratch, shared)
             elif isinstance(i, Call):
                 seeds = [f"b{reg if reg >= 0 else ~reg}" for reg in i.outputs]
                 inputs = [f"b{reg}" for reg in i.inputs]
                 yield from (f"    {line}" for line in kernel(i.kernel).adjoints(f"n{n}_", seeds, inputs))
             elif isinstance(i, Transfer):
-                yield from self._transferred_back(n, i)
+                yield from self._reverse_transfer(n, i)
             else:
                 for k in range(3):
                     yield f"    b{i.place + k} += b{i.out + k};"
         yield "}"
         yield "SYNC();"
         for field, moves in self._by_field(scratch).items():
-            yield from self._if_wanted(field, self._gathered(f"g{field}", moves, scratch, "+="))
-        for i in self._stage.transfers(COLLECT):
-            yield f"gather(h.nodes, {_arms(i)}, scratch + {self._rows[LOAD]}, h.g{i.field}, false);"
+            yield from self._if_wanted(field, self._gather(f"g{field}", moves, scratch, "+="))
+        for i in self._stage.transfers(Opcode.G2P):
+            rows = self._point_rows[Opcode.LOAD]
+            yield f"p2g(h.nodes, {_uses_arms(i)}, scratch + {rows}, h.g{i.field}, false);"
         for field in {field: None for field, _ in shared}:
-            own = [(c, name) for (f, c), name in shared.items() if f == field]
-            if self._fields[field].kind == Kind.PARAMETER:  # until the end
-                yield from (f"h.sums[{self._source.lasting[field, c]}] += {name};" for c, name in own)
+            sums = [(c, name) for (f, c), name in shared.items() if f == field]
+            if self._fields[field].kind == FieldKind.PARAMETER:  # until the end
+                yield from (f"h.sums[{self._layout.accumulated[field, c]}] += {name};" for c, name in sums)
             else:
-                yield from self._if_wanted(field, self._reduced([(f"g{field}[{c}]", name) for c, name in own]))
+                yield from self._if_wanted(field, self._reduce([(f"g{field}[{c}]", name) for c, name in sums]))
 
     # -- parts of the above -------------------------------------------------------------------------------------------
 
     def _comps(self, move: Move) -> int:
         return self._fields[move.field].comps
 
-    def _is_active(self, move: Move) -> bool:
-        return move.field in self._source.active
+    def _has_adjoint(self, move: Move) -> bool:
+        return move.field in self._layout.with_adjoint
 
-    def _begun(self, letters: str, scratch: dict[Move, int], shared: dict[tuple[int, int], str]) -> Iterator[str]:
-        """All before the instructions on an item."""
+    def _prologue(self, letters: str, scratch: dict[Move, int], shared: dict[tuple[int, int], str]) -> Iterator[str]:
+        """All lines before the instructions on an item."""
         for letter in letters:
             yield from self._pointers(letter)
         if shared:
             yield f"R {', '.join(f'{name} = R(0)' for name in shared.values())};"
-        yield from self._items(scratch)
+        yield from self._item_loop(scratch)
 
     def _slot(self, at: int, c: int) -> str:
-        """An item's number in scratch."""
+        """An item's number in scratch memory."""
         return f"scratch[{at + c * self._stage.items} + i]"
 
     def _pointers(self, letter: str) -> Iterator[str]:
-        """In registers; not where contact has nothing to do."""
-        if letter == "f" and self._stage.counted >= 0:
-            yield f"if (!{('h.some', 'h.woken', '(h.step == h.all - 1)')[self._stage.counted]}) return;"
+        """Pointers to the fields; return at once where contact has nothing to do."""
+        if letter == "f" and self._stage.contact_count >= 0:
+            yield f"if (!{ACTIVE_CONDITIONS[self._stage.contact_count]}) return;"
         read = {i.field for i in self._stage.code if not isinstance(i, Call)}
         for field in sorted(read):
-            if letter == "f" or field in self._source.active:
+            if letter == "f" or field in self._layout.with_adjoint:
                 yield f"R* const {letter}{field} = h.{letter}{field};"
         if letter == "f":
             yield "R* const scratch = h.scratch;"
 
-    def _items(self, scratch: dict[Move, int]) -> Iterator[str]:
-        """Their loop begins; of those that contact leaves out, nothing lies in ``scratch``."""
+    def _item_loop(self, scratch: dict[Move, int]) -> Iterator[str]:
+        """Begin of the loop; scratch memory of points that take no part is 0."""
         yield f"for (int i = T; i < {self._stage.items}; i += THREADS) {{"
-        if self._stage.counted >= 0:
-            takes = ("h.mask[t]", "h.mask[t] && !h.before[t]", "!h.mask[t]")[self._stage.counted]
+        if self._stage.contact_count >= 0:
             yield "    const int t = i / EACH;"
-            yield f"    if (!({takes})) {{"
+            yield f"    if (!({POINT_CONDITIONS[self._stage.contact_count]})) {{"
             for m, at in scratch.items():
                 yield "        " + " ".join(f"{self._slot(at, c)} = R(0);" for c in range(self._comps(m)))
             yield "        continue;"
             yield "    }"
-            for k in range(CORNERS):
-                yield f"    const int v{k} = h.tables[{self._source.corner(k)} + t];"
+            for k in range(TRIANGLE_CORNERS):
+                yield f"    const int v{k} = h.tables[{self._layout.corner_table(k)} + t];"
             yield "    const int s = i % EACH;"
-        for table in sorted({m.table for m in self._stage.moves(LOAD, ADD, PUT) if m.table >= 0}):
-            yield f"    const int w{table} = h.tables[{self._source.table(table)} + i];"
+        moves = self._stage.moves(Opcode.LOAD, Opcode.ADD, Opcode.STORE)
+        for table in sorted({m.table for m in moves if m.table >= 0}):
+            yield f"    const int w{table} = h.tables[{self._layout.table(table)} + i];"
 
-    def _place(self, move: Move, c: int) -> str:
-        if move.table == SHARED:
+    def _element(self, move: Move, c: int) -> str:
+        if move.table == SINGLE_ROW:
             return str(c)
-        if move.table <= VARYING:
-            row = ("v0", "v1", "v2", "t", "i", "s")[self._stage.listed(move.table)]
+        if move.table <= CONTACT_ROWS:
+            row = ("v0", "v1", "v2", "t", "i", "s")[self._stage.contact_table(move.table)]
         else:
-            row = "i" if move.table == OWN else f"w{move.table}"
+            row = "i" if move.table == ITEM_ROW else f"w{move.table}"
         return f"{row} * {self._comps(move)} + {c}"
 
-    def _computed(self, n: int, i: Call | Lookup | Transfer) -> Iterator[str]:
+    def _value_lines(self, n: int, i: Call | Lookup | Transfer) -> Iterator[str]:
         """Values of instruction ``n``."""
         if isinstance(i, Transfer):
-            return self._collected(n, i)
-        return self._called(n, i) if isinstance(i, Call) else self._looked_up(n, i)
+            return self._g2p(n, i)
+        return self._call(n, i) if isinstance(i, Call) else self._lookup(n, i)
 
-    def _collected(self, n: int, i: Transfer) -> Iterator[str]:
-        yield f"    R c{n}[{SHARES}];"
-        yield f"    for (int k = 0; k < {SHARES}; k++) c{n}[k] = R(0);"
+    def _g2p(self, n: int, i: Transfer) -> Iterator[str]:
+        yield f"    R c{n}[{TRANSFER_SHARES}];"
+        yield f"    for (int k = 0; k < {TRANSFER_SHARES}; k++) c{n}[k] = R(0);"
         yield f"    const R o{n}[3] = {{{self._offset(i)}}};"
-        yield f"    look(h.nodes, i, {_arms(i)}, o{n}, f{i.field}, c{n}, nullptr, nullptr);"
-        for k in range(SHARES):
-            yield f"    R r{i.share + k} = c{n}[{k}];"
+        yield f"    g2p(h.nodes, i, {_uses_arms(i)}, o{n}, f{i.field}, c{n}, nullptr, nullptr);"
+        for k in range(TRANSFER_SHARES):
+            yield f"    R r{i.shares + k} = c{n}[{k}];"
 
     def _offset(self, i: Transfer) -> str:
         return ", ".join(f"r{i.offset + d}" for d in range(3))
 
-    def _given(self, i: Transfer, shares: list[str], code: int) -> Iterator[str]:
-        """What a point gives to the nodes, in its row of scratch."""
+    def _store_point_row(self, i: Transfer, shares: list[str], code: int) -> Iterator[str]:
+        """Store what a point adds to the nodes in its row of scratch memory."""
         for k, value in enumerate([*shares, *(f"r{i.offset + d}" for d in range(3))]):
-            yield f"    scratch[{self._rows[code]} + {ROW} * i + {k}] = {value};"
+            yield f"    scratch[{self._point_rows[code]} + {POINT_ROW_NUMBERS} * i + {k}] = {value};"
 
-    def _transferred_back(self, n: int, i: Transfer) -> Iterator[str]:
-        letter = "r" if i.code == SPREAD else "b"
-        shares = [f"{letter}{i.share + k}" for k in range(SHARES)]
+    def _reverse_transfer(self, n: int, i: Transfer) -> Iterator[str]:
+        letter = "r" if i.code == Opcode.P2G else "b"
+        shares = [f"{letter}{i.shares + k}" for k in range(TRANSFER_SHARES)]
         yield "    {"
-        yield f"        const R o[3] = {{{self._offset(i)}}}, given[{SHARES}] = {{{', '.join(shares)}}};"
-        yield f"        R c[{SHARES}], turn[3] = {{R(0), R(0), R(0)}};"
-        yield f"        for (int k = 0; k < {SHARES}; k++) c[k] = R(0);"
-        if i.code == SPREAD:
-            yield f"        look(h.nodes, i, {_arms(i)}, o, g{i.field}, c, given, turn);"
-            for k in range(SHARES):
-                yield f"        b{i.share + k} += c[{k}];"
+        yield f"        const R o[3] = {{{self._offset(i)}}}, work[{TRANSFER_SHARES}] = {{{', '.join(shares)}}};"
+        yield f"        R c[{TRANSFER_SHARES}], turn[3] = {{R(0), R(0), R(0)}};"
+        yield f"        for (int k = 0; k < {TRANSFER_SHARES}; k++) c[k] = R(0);"
+        if i.code == Opcode.P2G:
+            yield f"        g2p(h.nodes, i, {_uses_arms(i)}, o, g{i.field}, c, work, turn);"
+            for k in range(TRANSFER_SHARES):
+                yield f"        b{i.shares + k} += c[{k}];"
         else:
-            yield f"        look(h.nodes, i, {_arms(i)}, o, f{i.field}, nullptr, given, turn);"
+            yield f"        g2p(h.nodes, i, {_uses_arms(i)}, o, f{i.field}, nullptr, work, turn);"
         for d in range(3):
             yield f"        b{i.offset + d} += turn[{d}];"
         yield "    }"
-        if i.code == COLLECT:
-            yield from self._given(i, shares, LOAD)
+        if i.code == Opcode.G2P:
+            yield from self._store_point_row(i, shares, Opcode.LOAD)
 
-    def _called(self, n: int, i: Call) -> Iterator[str]:
-        found = kernel(i.kernel)
-        yield from (f"    {line}" for line in found.values(f"n{n}_", [f"r{reg}" for reg in i.inputs]))
-        for reg, out in zip(i.outputs, found.out, strict=True):
+    def _call(self, n: int, i: Call) -> Iterator[str]:
+        listing = kernel(i.kernel)
+        yield from (f"    {line}" for line in listing.values(f"n{n}_", [f"r{reg}" for reg in i.inputs]))
+        for reg, out in zip(i.outputs, listing.out, strict=True):
             yield f"    R r{reg} = n{n}_{out};" if reg >= 0 else f"    r{~reg} += n{n}_{out};"
 
-    def _looked_up(self, n: int, i: Lookup) -> Iterator[str]:
+    def _lookup(self, n: int, i: Lookup) -> Iterator[str]:
         _, y, z = i.nodes
         for k in range(3):
             place = f"r{i.place + k}"
-            most = f"R({i.nodes[k] - 2})"
-            yield f"    const int n{n}_{k} = {place} > R(0) ? int({place} < {most} ? {place} : {most}) : 0;"
+            last = f"R({i.nodes[k] - 2})"
+            yield f"    const int n{n}_{k} = {place} > R(0) ? int({place} < {last} ? {place} : {last}) : 0;"
             yield f"    R r{i.out + k} = {place} - R(n{n}_{k});"
         for corner in range(8):
             at = f"((n{n}_0 + {corner >> 2}) * {y} + n{n}_1 + {corner >> 1 & 1}) * {z} + n{n}_2 + {corner & 1}"
             yield f"    R r{i.out + 3 + corner} = f{i.field}[{at}];"
 
-    def _registers(self) -> set[int]:
-        found: set[int] = set()
+    def _all_registers(self) -> set[int]:
+        registers: set[int] = set()
         for i in self._stage.code:
             if isinstance(i, Move):
-                found |= {i.reg + c for c in range(self._comps(i))}
+                registers |= {i.reg + c for c in range(self._comps(i))}
             elif isinstance(i, Transfer):
-                found |= {i.offset + d for d in range(3)} | {i.share + k for k in range(SHARES)}
+                registers |= {i.offset + d for d in range(3)} | {i.shares + k for k in range(TRANSFER_SHARES)}
             elif isinstance(i, Call):
-                found |= {*i.inputs, *(reg if reg >= 0 else ~reg for reg in i.outputs)}
+                registers |= {*i.inputs, *(reg if reg >= 0 else ~reg for reg in i.outputs)}
             else:
-                found |= {i.place + k for k in range(3)} | {i.out + k for k in range(11)}
-        return found
+                registers |= {i.place + k for k in range(3)} | {i.out + k for k in range(LOOKUP_REGISTERS)}
+        return registers
 
-    def _scratched(self, code: int) -> dict[Move, int]:
-        """Moves to rows where others may come, with the place of their numbers."""
-        wanted = [m for m in self._stage.moves(code) if code == ADD or self._is_active(m)]
-        met = [m for m in wanted if m.table != SHARED and not self._source.is_direct(self._stage, m, code)]
-        found, size = {}, 0
-        for moves in self._by_field(met).values():  # a field's side by side
+    def _scratch_places(self, code: int) -> dict[Move, int]:
+        """Moves to rows that other moves may access, with the places of their numbers in scratch memory."""
+        moves = [m for m in self._stage.moves(code) if code == Opcode.ADD or self._has_adjoint(m)]
+        scattered = [m for m in moves if m.table != SINGLE_ROW and not self._layout.is_direct(self._stage, m, code)]
+        places, size = {}, 0
+        for moves in self._by_field(scattered).values():  # the moves of a field lie next to each other
             for m in moves:
-                found[m] = size
+                places[m] = size
                 size += self._comps(m) * self._stage.items
-        self._rows[code] = size
-        if self._stage.transfers(SPREAD if code == ADD else COLLECT):
-            size += ROW * self._stage.items
-        self._source.need(scratch=size)
-        return found
+        self._point_rows[code] = size
+        if self._stage.transfers(Opcode.P2G if code == Opcode.ADD else Opcode.G2P):
+            size += POINT_ROW_NUMBERS * self._stage.items
+        self._layout.reserve(scratch=size)
+        return places
 
     @staticmethod
     def _by_field(moves: Iterable[Move]) -> dict[int, list[Move]]:
-        found: dict[int, list[Move]] = {}
+        grouped: dict[int, list[Move]] = {}
         for m in moves:
-            found.setdefault(m.field, []).append(m)
-        return found
+            grouped.setdefault(m.field, []).append(m)
+        return grouped
 
-    def _gathered(self, target: str, moves: list[Move], scratch: dict[Move, int], how: str) -> Iterator[str]:
-        first, entries = self._source.gather(self._stage, moves)
+    def _gather(self, target: str, moves: list[Move], scratch: dict[Move, int], assign: str) -> Iterator[str]:
+        first, entries = self._layout.gather_tables(self._stage, moves)
         comps, n, base = self._comps(moves[0]), self._stage.items, scratch[moves[0]]
         yield f"for (int v = T; v < {self._fields[moves[0].field].rows}; v += THREADS) {{"
         yield f"    R {', '.join(f'a{c} = R(0)' for c in range(comps))};"
@@ -266,14 +274,14 @@ class OfLoop:
             yield f"        a{c} += scratch[at + {c * n}];"
         yield "    }"
         for c in range(comps):
-            yield f"    {target}[v * {comps} + {c}] {how} a{c};"
+            yield f"    {target}[v * {comps} + {c}] {assign} a{c};"
         yield "}"
         yield "SYNC();"
 
-    def _reduced(self, sums: list[tuple[str, str]]) -> Iterator[str]:
-        self._source.need(shared=len(sums))
-        yield f"{{ const R own[{len(sums)}] = {{{', '.join(name for _, name in sums)}}};"
-        yield f"  reduce(own, {len(sums)}, h.shared); }}"
+    def _reduce(self, sums: list[tuple[str, str]]) -> Iterator[str]:
+        self._layout.reserve(shared=len(sums))
+        yield f"{{ const R numbers[{len(sums)}] = {{{', '.join(name for _, name in sums)}}};"
+        yield f"  reduce(numbers, {len(sums)}, h.shared); }}"
         yield "if (T == 0) {"
         for k, (target, _) in enumerate(sums):
             yield f"    {target} += h.shared[{k}];"
@@ -281,31 +289,33 @@ class OfLoop:
         yield "SYNC();"
 
     def _if_wanted(self, field: int, lines: Iterator[str]) -> Iterator[str]:
-        """Gradients of inputs may not be asked for."""
-        if self._fields[field].kind not in (Kind.PARAMETER, Kind.DRIVE):
+        """Guard the lines where nobody may want the gradient of an input."""
+        if self._fields[field].kind not in (FieldKind.PARAMETER, FieldKind.PER_SUBSTEP):
             yield from lines
             return
         yield f"if (g{field}) {{"
         yield from (f"    {line}" for line in lines)
         yield "}"
 
-    def _moved_back(self, m: Move, scratch: dict[Move, int], shared: dict[tuple[int, int], str]) -> Iterator[str]:
-        if not self._is_active(m):
+    def _reverse_move(self, m: Move, scratch: dict[Move, int], shared: dict[tuple[int, int], str]) -> Iterator[str]:
+        if not self._has_adjoint(m):
             return
-        asked = f"if (g{m.field}) " if self._fields[m.field].kind in (Kind.PARAMETER, Kind.DRIVE) else ""
+        guard = (
+            f"if (g{m.field}) " if self._fields[m.field].kind in (FieldKind.PARAMETER, FieldKind.PER_SUBSTEP) else ""
+        )
         for c in range(self._comps(m)):
-            place, bar = f"g{m.field}[{self._place(m, c)}]", f"b{m.reg + c}"
-            if m.code != LOAD:
+            place, bar = f"g{m.field}[{self._element(m, c)}]", f"b{m.reg + c}"
+            if m.code != Opcode.LOAD:
                 yield f"    {bar} += {place};"
-                if m.code == PUT:  # what was there before does not count any more
+                if m.code == Opcode.STORE:  # the earlier value was overwritten
                     yield f"    {place} = R(0);"
-            elif m.table == SHARED:
+            elif m.table == SINGLE_ROW:
                 yield f"    {shared[m.field, c]} += {bar};"
             elif m in scratch:
-                yield f"    {asked}{self._slot(scratch[m], c)} = {bar};"
+                yield f"    {guard}{self._slot(scratch[m], c)} = {bar};"
             else:
-                yield f"    {asked}{place} += {bar};"
+                yield f"    {guard}{place} += {bar};"
 
 
-def _arms(i: Transfer) -> str:
-    return str(i.by == By.ARMS).lower()
+def _uses_arms(i: Transfer) -> str:
+    return str(i.basis == TransferBasis.AFFINE).lower()

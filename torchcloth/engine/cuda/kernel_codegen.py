@@ -1,6 +1,6 @@
-"""The engine's kernels as straight lines of C++: values, and their adjoints.
+"""The engine's kernels as straight-line C++: values, and their adjoints.
 
-``csrc/tape.h`` writes a kernel's operations down at compile time; the library gives them as numbers.
+``csrc/tape.h`` records a kernel's operations at compile time; the library returns them as numbers.
 """
 
 from __future__ import annotations
@@ -10,14 +10,10 @@ from collections.abc import Iterator, Sequence
 from functools import cache
 from typing import NamedTuple
 
+from ..enums import TapeOp
 from ..library import kernels, library
 
-# as in csrc/tape.h
-OPERATIONS = (
-    *("input", "constant", "add", "sub", "mul", "div", "addc", "rsubc", "mulc", "rdivc", "neg", "sqrt", "exp", "expm1"),
-    *("atan2", "abs", "at_least", "at_most", "less", "lessc", "cless", "select", "detach"),
-)
-VALUES = {
+VALUE = {
     "add": "{a} + {b}",
     "sub": "{a} - {b}",
     "mul": "{a} * {b}",
@@ -41,8 +37,8 @@ VALUES = {
     "detach": "{a}",
     "constant": "{value}",
 }
-# adjoints of the first and the second operand, from that of the operation, {g}; {own} is its value
-FIRST = {
+# adjoints of the left and the right operand, from the operation's adjoint {g}; {result} is the operation's value
+LEFT_ADJOINT = {
     "add": "{g}",
     "sub": "{g}",
     "addc": "{g}",
@@ -51,89 +47,103 @@ FIRST = {
     "rsubc": "-{g}",
     "neg": "-{g}",
     "mulc": "{g} * {value}",
-    "rdivc": "-({g} * ({own} / {a}))",
-    "sqrt": "{g} * (R(0.5) / {own})",
-    "exp": "{g} * {own}",
-    "expm1": "{g} * ({own} + R(1))",
+    "rdivc": "-({g} * ({result} / {a}))",
+    "sqrt": "{g} * (R(0.5) / {result})",
+    "exp": "{g} * {result}",
+    "expm1": "{g} * ({result} + R(1))",
     "atan2": "{g} * ({b} / ({a} * {a} + {b} * {b}))",
     "abs": "(R(0) < {a} ? {g} : {a} < R(0) ? -{g} : R(0))",
     "at_least": "({a} < {value} ? R(0) : {g})",
     "at_most": "({value} < {a} ? R(0) : {g})",
     "select": "({c} != R(0) ? {g} : R(0))",
 }
-SECOND = {
+RIGHT_ADJOINT = {
     "add": "{g}",
     "sub": "-{g}",
     "mul": "{g} * {a}",
-    "div": "-({g} * ({own} / {b}))",
+    "div": "-({g} * ({result} / {b}))",
     "atan2": "-({g} * ({a} / ({a} * {a} + {b} * {b})))",
     "select": "({c} != R(0) ? R(0) : {g})",
 }
 
 
 class Operation(NamedTuple):
-    """One of a kernel; operands are numbers of earlier ones, or -1. Of an input, ``a`` is which."""
+    """An operation of a kernel.
+
+    Attributes:
+        name: of a ``TapeOp``, in lower case.
+        a, b, c: operands, numbers of earlier operations; -1: none. Of an input, ``a`` says which.
+        varies: whether it has a derivative.
+        value: constant operand.
+    """
 
     name: str
     a: int
     b: int
     c: int
-    varies: bool  # it has a derivative
+    varies: bool
     value: float
 
 
 class Kernel(NamedTuple):
-    """All of them, and which are the results."""
+    """A kernel.
+
+    Attributes:
+        operations: all operations in order.
+        out: numbers of the operations that are results.
+    """
 
     operations: tuple[Operation, ...]
     out: tuple[int, ...]
 
-    def values(self, own: str, inputs: Sequence[str]) -> Iterator[str]:
-        """Lines that define ``own``0, ``own``1, ... from expressions for the inputs."""
+    def values(self, prefix: str, inputs: Sequence[str]) -> Iterator[str]:
+        """Yield lines that define ``prefix``0, ``prefix``1, ... from expressions for the inputs."""
         for i, o in enumerate(self.operations):
-            found = inputs[o.a] if o.name == "input" else VALUES[o.name].format(**self._names(own, i))
-            yield f"const R {own}{i} = {found};"
+            expression = inputs[o.a] if o.name == "input" else VALUE[o.name].format(**self._names(prefix, i))
+            yield f"const R {prefix}{i} = {expression};"
 
-    def adjoints(self, own: str, seeds: Sequence[str], inputs: Sequence[str]) -> Iterator[str]:
-        """Lines behind ``values`` that add to the adjoints of the inputs, from those of the results."""
-        there: set[int] = set()  # operations that have an adjoint already
+    def adjoints(self, prefix: str, seeds: Sequence[str], inputs: Sequence[str]) -> Iterator[str]:
+        """Yield lines that follow ``values`` and add to the adjoints of the inputs, from those of the results."""
+        assigned: set[int] = set()  # operations that have an adjoint already
 
-        def give(to: int, what: str) -> str:
-            begins = "R " if to not in there else ""
-            there.add(to)
-            return f"{begins}{own}g{to} {'=' if begins else '+='} {what};"
+        def accumulate(to: int, what: str) -> str:
+            declaration = "R " if to not in assigned else ""
+            assigned.add(to)
+            return f"{declaration}{prefix}g{to} {'=' if declaration else '+='} {what};"
 
         for to, seed in zip(self.out, seeds, strict=True):
-            yield give(to, seed)
+            yield accumulate(to, seed)
         for i in reversed(range(len(self.operations))):
             o = self.operations[i]
-            if i not in there or not o.varies:
+            if i not in assigned or not o.varies:
                 continue
             if o.name == "input":
-                yield f"{inputs[o.a]} += {own}g{i};"
+                yield f"{inputs[o.a]} += {prefix}g{i};"
                 continue
-            names = self._names(own, i) | {"g": f"{own}g{i}", "own": f"{own}{i}"}
-            for operand, share in ((o.a, FIRST), (o.b, SECOND)):
+            names = self._names(prefix, i) | {"g": f"{prefix}g{i}", "result": f"{prefix}{i}"}
+            for operand, adjoint in ((o.a, LEFT_ADJOINT), (o.b, RIGHT_ADJOINT)):
                 if operand >= 0 and self.operations[operand].varies:
-                    yield give(operand, share[o.name].format(**names))
+                    yield accumulate(operand, adjoint[o.name].format(**names))
 
-    def _names(self, own: str, i: int) -> dict[str, str]:
+    def _names(self, prefix: str, i: int) -> dict[str, str]:
         o = self.operations[i]
-        return {"a": f"{own}{o.a}", "b": f"{own}{o.b}", "c": f"{own}{o.c}", "value": number(o.value)}
+        names = {"a": f"{prefix}{o.a}", "b": f"{prefix}{o.b}", "c": f"{prefix}{o.c}"}
+        return names | {"value": cpp_number(o.value)}
 
 
-def number(value: float) -> str:
-    """In C++, in the program's precision."""
+def cpp_number(value: float) -> str:
+    """Return a number as C++ in the program's precision."""
     return f"R({value!r})"
 
 
 @cache
-def kernel(which: int) -> Kernel:
-    """By the engine's number."""
+def kernel(number: int) -> Kernel:
+    """Return a kernel by the engine's number."""
     lib = library()
-    _, _, gives = next(found for found in kernels().values() if found[0] == which)
-    size = lib.tc_kernel_size(which)
-    operations, values, out = (ctypes.c_int * (5 * size))(), (ctypes.c_double * size)(), (ctypes.c_int * gives)()
-    lib.tc_kernel_listing(which, operations, values, out)
-    rows = zip(*(operations[k::5] for k in range(5)), values, strict=True)
-    return Kernel(tuple(Operation(OPERATIONS[op], a, b, c, bool(v), x) for op, a, b, c, v, x in rows), tuple(out))
+    _, _, outputs = next(info for info in kernels().values() if info[0] == number)
+    size = lib.tc_kernel_size(number)
+    codes, values, out = (ctypes.c_int * (5 * size))(), (ctypes.c_double * size)(), (ctypes.c_int * outputs)()
+    lib.tc_kernel_listing(number, codes, values, out)
+    rows = zip(*(codes[k::5] for k in range(5)), values, strict=True)
+    operations = (Operation(TapeOp(op).name.lower(), a, b, c, bool(v), x) for op, a, b, c, v, x in rows)
+    return Kernel(tuple(operations), tuple(out))

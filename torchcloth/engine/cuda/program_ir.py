@@ -1,4 +1,4 @@
-"""What a program consists of, from the calls that hand it to the engine."""
+"""Intermediate representation of a program, from the recorded calls that hand it to the engine."""
 
 from __future__ import annotations
 
@@ -7,40 +7,60 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..fields import Kind
-from ..loops import ADD, LOAD, PUT, VARYING, By
+from ..enums import CONTACT_ROWS, ContactTable, FieldKind, Opcode, StencilForm, TransferBasis
 
-ROOM = 8  # slots for nodes, at least, for every point that a cloth has; most see the same nodes
-CORNERS = 3  # of a triangle
-LISTS = (0, 7, 13)  # where those of points, of woken ones and of those asleep begin: parts/contact.py
+MIN_NODE_SLOTS_PER_POINT = 8  # slots of the node table for every contact point of a cloth; most see the same nodes
+TRIANGLE_CORNERS = 3
+_GROUP_STARTS = (0, ContactTable.ACTIVATED, ContactTable.INACTIVE)  # first table, by ``ContactCount``
 
 
-class Place(NamedTuple):
-    """A field as the listing has it."""
+class FieldDecl(NamedTuple):
+    """A field of the program.
 
-    kind: Kind
+    Attributes:
+        kind: what it holds.
+        rows: rows; those of nodes and points are the most that there can be.
+        comps: components of a row.
+        neighbours: of the weights of a stencil, else 0.
+        data: numbers of a constant, else None.
+    """
+
+    kind: FieldKind
     rows: int
     comps: int
-    near: int  # of the weights of a stencil
-    data: np.ndarray | None  # of a constant
+    neighbours: int
+    data: np.ndarray | None
 
     @property
     def size(self) -> int:
-        """Numbers."""
+        """Count of numbers."""
         return self.rows * self.comps
 
 
 class Move(NamedTuple):
-    """Between registers and rows."""
+    """Transfer between registers and a row.
 
-    code: int  # LOAD, ADD, PUT
+    Attributes:
+        code: ``Opcode.LOAD``, ``ADD`` or ``STORE``.
+        field: number of the field.
+        table: number of the table of rows, or ``ITEM_ROW``, ``SINGLE_ROW``, ``CONTACT_ROWS`` and below.
+        reg: first register.
+    """
+
+    code: int
     field: int
     table: int
     reg: int
 
 
 class Call(NamedTuple):
-    """A kernel on registers; results by ~register are added to it."""
+    """A kernel on registers.
+
+    Attributes:
+        kernel: number of the kernel.
+        inputs: registers.
+        outputs: registers; results by ~register are add_impulses to it.
+    """
 
     kernel: int
     inputs: tuple[int, ...]
@@ -48,153 +68,206 @@ class Call(NamedTuple):
 
 
 class Lookup(NamedTuple):
-    """Fractions and corners of the cell of a grid."""
+    """Fractions and corner values of the cell of a grid.
+
+    Attributes:
+        field: values at the grid's nodes.
+        nodes: nodes along x, y and z.
+        place: first register of the place.
+        out: first register of the results.
+    """
 
     field: int
     nodes: tuple[int, int, int]
-    place: int  # first register
-    out: int  # likewise
+    place: int
+    out: int
 
 
 class Transfer(NamedTuple):
-    """Between a point's registers and the nodes around it."""
+    """Transfer between a contact point's registers and the nodes around it.
 
-    code: int  # SPREAD, COLLECT
-    field: int  # of the nodes
-    offset: int  # first register
-    share: int  # likewise, of SHARES
-    by: By
+    Attributes:
+        code: ``Opcode.P2G`` or ``Opcode.G2P``.
+        field: field of the nodes.
+        offset: first register of the point's offset.
+        shares: first register of its shares.
+        basis: what the shares multiply.
+    """
+
+    code: int
+    field: int
+    offset: int
+    shares: int
+    basis: TransferBasis
 
 
 class Loop(NamedTuple):
-    """Instructions on every item."""
+    """Instructions on every item.
+
+    Attributes:
+        items: items; of contact points all that there are.
+        no_derivative: results have no derivative.
+        code: instructions.
+        contact_count: which contact points it runs on, a ``ContactCount``; -1: all items.
+    """
 
     items: int
-    flat: bool
+    no_derivative: bool
     code: list[Move | Call | Lookup | Transfer]
-    counted: int = -1  # on those points of contact alone: POINTS, WOKEN, ASLEEP; -1: on all items
+    contact_count: int = -1
 
     def moves(self, *codes: int) -> list[Move]:
-        """Those of some codes."""
+        """Return the moves of these codes."""
         return [i for i in self.code if isinstance(i, Move) and i.code in codes]
 
     def transfers(self, code: int) -> list[Transfer]:
-        """Those of a code."""
+        """Return the transfers of this code."""
         return [i for i in self.code if isinstance(i, Transfer) and i.code == code]
 
-    def listed(self, table: int) -> int:
-        """Of a table of contact, what ``Layers.rows`` takes."""
-        return VARYING - table - LISTS[self.counted]
+    def contact_table(self, table: int) -> int:
+        """Return the ``ContactTable`` that a table number means, counted from the start of the loop's group."""
+        return CONTACT_ROWS - table - _GROUP_STARTS[self.contact_count]
 
 
 class Stencil(NamedTuple):
-    """Differences to neighbours, or their transpose."""
+    """Weighted differences to neighbours, or their transpose.
+
+    Attributes:
+        table: number of the table of neighbours.
+        weight, x, y: numbers of fields.
+        form: plain, transposed or symmetric.
+    """
 
     table: int
     weight: int
     x: int
     y: int
-    shape: int
+    form: StencilForm
 
 
-class Layers(NamedTuple):
-    """Which triangles take part in contact between layers, and the nodes around their points."""
+class ContactSearch(NamedTuple):
+    """Which triangles are active in contact between layers, and the nodes around their points.
+
+    Attributes:
+        x: field of the positions.
+        lowest_node: field of each point's lowest node.
+        fields: fields of nodes and points.
+        corners: [3, E] vertices.
+        places: [S, 3] barycentric coordinates of a triangle's points.
+        spacing, skin, reach: of the grid [m].
+        search_interval: substeps after which the search is repeated in any case.
+        non_adjacent: [E, E] bool, pairs far apart along the cloth; None: all triangles are always active.
+    """
 
     x: int
-    base: int  # field of the points: lowest node
-    fields: tuple[int, ...]  # of nodes and points
-    corners: np.ndarray  # [3, E]
-    places: np.ndarray  # [S, 3] barycentric
-    spacing: float  # m
-    skin: float  # m
-    reach: float  # m
-    chunk: int
-    apart: np.ndarray | None  # [E, E] bool; None: all triangles take part always
+    lowest_node: int
+    fields: tuple[int, ...]
+    corners: np.ndarray
+    places: np.ndarray
+    spacing: float
+    skin: float
+    reach: float
+    search_interval: int
+    non_adjacent: np.ndarray | None
 
     @property
     def triangles(self) -> int:
-        """E."""
+        """Count of triangles E."""
         return self.corners.shape[1]
 
     @property
     def points(self) -> int:
-        """E S."""
+        """Count of points E S."""
         return self.triangles * len(self.places)
 
     @property
-    def room(self) -> int:
+    def node_slots(self) -> int:
         """Slots for nodes, a power of two."""
-        return 1 << max(10, (ROOM * self.points - 1).bit_length())
+        return 1 << max(10, (MIN_NODE_SLOTS_PER_POINT * self.points - 1).bit_length())
 
-    def rows(self, which: int) -> np.ndarray:
-        """[E S] of each point, by what ``parts.contact.Rows`` names first: corners, triangle, own, place."""
+    def rows(self, table: int) -> np.ndarray:
+        """Return the rows [E S] of each point, by a ``ContactTable`` of the first group."""
         each, triangle = len(self.places), np.repeat(np.arange(self.triangles), len(self.places))
-        if which < CORNERS:
-            return self.corners[which][triangle]
-        return (triangle, np.arange(self.points), np.tile(np.arange(each), self.triangles))[which - CORNERS]
+        if table < TRIANGLE_CORNERS:
+            return self.corners[table][triangle]
+        tables = (triangle, np.arange(self.points), np.tile(np.arange(each), self.triangles))
+        return tables[table - ContactTable.TRIANGLE]
 
 
-class PerMass(NamedTuple):
-    """out = given / mass on the nodes."""
+class GridVelocity(NamedTuple):
+    """velocity = momentum / mass on the nodes; numbers of fields, and the mass [kg] below which it is 0."""
 
     mass: int
-    given: int
-    out: int
-    least: float
+    momentum: int
+    velocity: int
+    min_mass: float
 
 
-Stage = Loop | Stencil | Layers | PerMass
+Stage = Loop | Stencil | ContactSearch | GridVelocity
 
 
-class Listing(NamedTuple):
-    """A program."""
+class ProgramIR(NamedTuple):
+    """A program.
 
-    fields: list[Place]
-    next: dict[int, int]  # where states go
+    Attributes:
+        fields: by number.
+        next: field at the end of a substep, by that of the state at its start.
+        tables: rows, by number.
+        stages: in order.
+    """
+
+    fields: list[FieldDecl]
+    next: dict[int, int]
     tables: list[np.ndarray]
     stages: list[Stage]
 
     @property
-    def layers(self) -> Layers | None:
-        """Of a program with contact."""
-        return next((stage for stage in self.stages if isinstance(stage, Layers)), None)
+    def contact(self) -> ContactSearch | None:
+        """The contact search; None without contact."""
+        return next((stage for stage in self.stages if isinstance(stage, ContactSearch)), None)
 
 
-def listing(written: Sequence[tuple[str, tuple]]) -> Listing:
-    """Of what ``Program`` has written down."""
-    found = Listing([], {}, [], [])
-    points: dict[int, int] = {}  # of each sieve
-    for name, given in written:
+def parse_program(calls: Sequence[tuple[str, tuple]]) -> ProgramIR:
+    """Return the representation of a program, from the calls that ``Program`` has recorded.
+
+    Raises:
+        ValueError: a call is unknown.
+    """
+    program = ProgramIR([], {}, [], [])
+    points: dict[int, int] = {}  # by broad phase
+    for name, arguments in calls:
         if name == "field":
-            kind, rows, comps, near, _, data = given
-            found.fields.append(Place(Kind(kind), rows, comps, near, data))
-        elif name == "pair":
-            found.next[given[0]] = given[1]
+            kind, rows, comps, neighbours, _, data = arguments
+            program.fields.append(FieldDecl(FieldKind(kind), rows, comps, neighbours, data))
+        elif name == "next_state":
+            program.next[arguments[0]] = arguments[1]
         elif name == "table":
-            found.tables.append(given[0])
+            program.tables.append(arguments[0])
         elif name == "loop":
-            items, among, counted, flat, _ = given
-            if counted >= 0 and found.layers is not None:
-                items = found.layers.points
-            # points out of a body's reach change nothing: all are gone through, and none is looked for
-            found.stages.append(Loop(points[among] if among >= 0 else items, bool(flat), [], counted))
-        elif name == "sieve":
-            points[given[0]] = int(found.tables[given[5]][-1])
-        elif name == "contact":
-            found.stages.append(_layers(*given))
-        elif name == "per_mass":
-            found.stages.append(PerMass(*given))
+            items, point_list, contact_count, no_derivative, _ = arguments
+            if contact_count >= 0 and program.contact is not None:
+                items = program.contact.points
+            # points out of a body's reach change nothing: all are visited, and there is no broad phase
+            items = points[point_list] if point_list >= 0 else items
+            program.stages.append(Loop(items, bool(no_derivative), [], contact_count))
+        elif name == "broad_phase":
+            points[arguments[0]] = int(program.tables[arguments[5]][-1])
+        elif name == "contact_search":
+            program.stages.append(_contact_search(*arguments))
+        elif name == "grid_velocity":
+            program.stages.append(GridVelocity(*arguments))
         elif name == "stencil":
-            found.stages.append(Stencil(*given))
+            table, weight, x, y, form = arguments
+            program.stages.append(Stencil(table, weight, x, y, StencilForm(form)))
         else:
-            _code(found).append(_instruction(name, given))
-    if (layers := found.layers) is not None:
-        rows = {Kind.POINTS: layers.points, Kind.NODES: layers.room}
-        found.fields[:] = [f._replace(rows=rows.get(f.kind, f.rows)) for f in found.fields]
-    return found
+            _code_of_last_loop(program).append(_instruction(name, arguments))
+    if (contact := program.contact) is not None:
+        rows = {FieldKind.POINTS: contact.points, FieldKind.NODES: contact.node_slots}
+        program.fields[:] = [f._replace(rows=rows.get(f.kind, f.rows)) for f in program.fields]
+    return program
 
 
-def _layers(
+def _contact_search(
     fields: tuple[int, ...],
     count: int,
     corners: np.ndarray,
@@ -204,36 +277,39 @@ def _layers(
     lengths: np.ndarray,
     limits: tuple[int, int, int],
     order: np.ndarray,
-    starts: np.ndarray,
-    meet: np.ndarray,
-    apart: np.ndarray,
-) -> Layers:
+    patch_starts: np.ndarray,
+    patches_may_meet: np.ndarray,
+    non_adjacent: np.ndarray,
+) -> ContactSearch:
     spacing, skin, reach = map(float, lengths)
-    chunk, patches, size = limits
+    search_interval, patches, size = limits
     matrix = None
     if patches:  # a bit for each triangle of a patch
         matrix = np.zeros((triangles, triangles), bool)
-        bits = np.unpackbits(apart.reshape(triangles, patches, 1), axis=-1, bitorder="little")[..., :size].astype(bool)
+        packed = non_adjacent.reshape(triangles, patches, 1)
+        bits = np.unpackbits(packed, axis=-1, bitorder="little")[..., :size].astype(bool)
         for patch in range(patches):
-            own = order[starts[patch] : starts[patch + 1]]
-            matrix[np.ix_(order, own)] = bits[:, patch, : len(own)]
-    return Layers(fields[0], fields[1], fields[2:], corners, places, spacing, skin, reach, chunk, matrix)
+            members = order[patch_starts[patch] : patch_starts[patch + 1]]
+            matrix[np.ix_(order, members)] = bits[:, patch, : len(members)]
+    return ContactSearch(
+        fields[0], fields[1], fields[2:], corners, places, spacing, skin, reach, search_interval, matrix
+    )
 
 
-def _code(found: Listing) -> list[Move | Call | Lookup | Transfer]:
-    last = found.stages[-1]
+def _code_of_last_loop(program: ProgramIR) -> list[Move | Call | Lookup | Transfer]:
+    last = program.stages[-1]
     if not isinstance(last, Loop):
         raise ValueError("no loop to add to")
     return last.code
 
 
-def _instruction(name: str, given: tuple) -> Move | Call | Lookup | Transfer:
-    if name == "move" and given[0] in (LOAD, ADD, PUT):
-        return Move(*given)
-    if name == "call":
-        return Call(given[0], given[1], given[2])
+def _instruction(name: str, arguments: tuple) -> Move | Call | Lookup | Transfer:
+    if name == "move" and arguments[0] in (Opcode.LOAD, Opcode.ADD, Opcode.STORE):
+        return Move(*arguments)
+    if name == "kernel":
+        return Call(arguments[0], arguments[1], arguments[2])
     if name == "lookup":
-        return Lookup(given[0], given[1:4], given[4], given[5])
+        return Lookup(arguments[0], arguments[1:4], arguments[4], arguments[5])
     if name == "transfer":
-        return Transfer(given[0], given[1], given[3], given[4], By(given[5]))
+        return Transfer(arguments[0], arguments[1], arguments[3], arguments[4], TransferBasis(arguments[5]))
     raise ValueError(f"no instruction {name!r}")

@@ -1,4 +1,4 @@
-"""A device is believed after it did what the processor does: some substeps, and their adjoint."""
+"""Self-test of a device: it must do as the CPU does, on some substeps and their adjoint."""
 
 from __future__ import annotations
 
@@ -6,51 +6,60 @@ import torch
 from torch import Tensor
 
 from .. import execution
+from ..enums import FieldKind
 from ..execution import Job
-from ..fields import Field, Kind
+from ..fields import Field
 from . import launch
 
-MARKS = {torch.float64: 1e-6, torch.float32: 0.05}  # of the root mean squares; what goes wrong there is of order 1
-CHUNK = 5  # substeps that an adjoint keeps at a time: it comes to chunks in longer simulations as well
-TINY = 1e-300
+# relative to root mean squares; a wrong kernel gives errors of order 1
+MAX_RELATIVE_ERROR = {torch.float64: 1e-6, torch.float32: 0.05}
+ADJOINT_CHUNK_SUBSTEPS = 5  # so few that the test has several chunks, as longer simulations do
+MIN_RMS = 1e-300  # no division by 0
+SEED_FLOOR = 1e-3  # of the largest component: a component that stays 0 gets no large seed
 
 
-def agrees(job: Job, rounding: Field | None) -> bool:
-    """Whether a job gives on its device what it gives here; one that is not finite here tells nothing.
+def matches_cpu(job: Job, rounding: Field | None) -> bool:
+    """Return whether a job gives the same on its device as on the CPU.
 
-    ``rounding``: the result that holds what was lost in it, which has no digits to compare.
+    A job that is not finite on the CPU cannot be compared, and counts as the same.
+
+    Args:
+        job: the job, with tensors on the device.
+        rounding: result with the compensation of the positions, which has no significant digits.
     """
-    here = job._replace(inputs={f: t.cpu() for f, t in job.inputs.items()})
-    known, records = execution.forward(here, 1)
-    if not all(bool(torch.isfinite(t).all()) for t in known.values()):
+    on_cpu = job._replace(inputs={f: t.cpu() for f, t in job.inputs.items()})
+    expected, records = execution.forward(on_cpu, 1)
+    if not all(bool(torch.isfinite(t).all()) for t in expected.values()):
         return True
-    seeds = {f: torch.zeros_like(t) if f == rounding else _seed(t, f.id) for f, t in known.items()}
-    adjoints = execution.reverse(here, records, 1, seeds, set(here.inputs))
-    found, masks = launch.forward(job)
-    given = {f: t.to(job.like.device) for f, t in seeds.items()}
-    others = launch.reverse(job, masks, given, set(job.inputs), CHUNK)
+    seeds = {f: torch.zeros_like(t) if f == rounding else _random_seed(t, f.id) for f, t in expected.items()}
+    expected_adjoints = execution.reverse(on_cpu, records, 1, seeds, set(on_cpu.inputs))
+    values, masks = launch.forward(job)
+    device_seeds = {f: t.to(job.like.device) for f, t in seeds.items()}
+    adjoints = launch.reverse(job, masks, device_seeds, set(job.inputs), ADJOINT_CHUNK_SUBSTEPS)
     eps = 1e3 * torch.finfo(job.program.dtype).eps
-    states = [f for f in job.program.inputs if f.kind == Kind.STATE]
-    before = dict(zip([f for f in known if f.kind == Kind.NEXT], states, strict=True))
-    apart = []
-    for f in known.keys() - {rounding}:
-        change = known[f] - here.inputs[before[f]] if f in before else known[f]
-        apart.append(_size(found[f].cpu() - known[f]) / (_size(change) + eps * _size(known[f]) + TINY))
-    sizes = {f: _size(t) for f, t in here.inputs.items()}
-    sizes |= {now: torch.maximum(sizes[now], _size(known[after])) for after, now in before.items()}  # what begins at 0
-    effects = {f: _size(t) * sizes[f] for f, t in adjoints.items()}  # of all that there is of an input
-    for f, effect in effects.items():
-        error = _size(others[f].cpu() - adjoints[f]) * sizes[f]
-        apart.append(error / (effect + eps * max(effects.values()) + TINY))
-    return bool(torch.stack(apart).max() <= MARKS[job.program.dtype])  # not where one is NaN
+    states = [f for f in job.program.inputs if f.kind == FieldKind.STATE]
+    before = dict(zip([f for f in expected if f.kind == FieldKind.NEXT], states, strict=True))
+    errors = []
+    for f in expected.keys() - {rounding}:
+        change = expected[f] - on_cpu.inputs[before[f]] if f in before else expected[f]
+        scale = _rms(change) + eps * _rms(expected[f]) + MIN_RMS
+        errors.append(_rms(values[f].cpu() - expected[f]) / scale)
+    # sizes of the inputs, and of states that begin at 0 those of the results
+    sizes = {f: _rms(t) for f, t in on_cpu.inputs.items()}
+    sizes |= {now: torch.maximum(sizes[now], _rms(expected[after])) for after, now in before.items()}
+    influences = {f: _rms(t) * sizes[f] for f, t in expected_adjoints.items()}
+    for f, influence in influences.items():
+        error = _rms(adjoints[f].cpu() - expected_adjoints[f]) * sizes[f]
+        errors.append(error / (influence + eps * max(influences.values()) + MIN_RMS))
+    return bool(torch.stack(errors).max() <= MAX_RELATIVE_ERROR[job.program.dtype])  # False if one is NaN
 
 
-def _seed(values: Tensor, number: int) -> Tensor:
-    """Random, and such that components count alike, whatever their units, but for those that stay 0."""
+def _random_seed(values: Tensor, number: int) -> Tensor:
+    """Random, and such that components count equally, whatever their units, but for those that stay 0."""
     noise = torch.randn(values.shape, generator=torch.Generator().manual_seed(number), dtype=torch.float64)
     size = values.double().square().mean((0, 1), keepdim=True).sqrt()
-    return (noise / torch.maximum(size, 1e-3 * size.amax()).clamp(min=1e-12)).to(values)
+    return (noise / torch.maximum(size, SEED_FLOOR * size.amax()).clamp(min=1e-12)).to(values)
 
 
-def _size(values: Tensor) -> Tensor:
+def _rms(values: Tensor) -> Tensor:
     return values.double().square().mean().sqrt()

@@ -10,71 +10,75 @@ from torch import Tensor
 from ...effects import Bending, BendingFriction, CreasingBending, SaturatingBending
 from ...effects._plate import Plate
 from ...effects.bending import Coefficients
-from ...effects.saturating import Coefficients as Saturating
+from ...effects.saturating import Coefficients as SaturatingCoefficients
+from ..builder import BendingLoop, SubstepBuilder, lowers
+from ..enums import StencilForm
 from ..fields import Field
-from ..lowering import Lowering
-from ..shared_loops import Sheet
-from ..stages import Shape
 
 
-def plate(low: Lowering, name: str, effect: Bending, c: Coefficients) -> None:
-    """Elastic and viscous, by one matrix; and what rest curvature adds."""
-    _matrix(low, effect, c)
+@lowers(Bending)
+def lower_bending(builder: SubstepBuilder, name: str, effect: Bending, c: Coefficients) -> None:
+    """Add elastic and viscous bending by one matrix, and the moment of the rest curvature."""
+    _add_plate_forces(builder, effect, c)
     if c.curl is not None:
-        sheet = low.sheet(effect.sheet)
-        _rest_moment(sheet, low, c, sheet.loop.load(low.parameter(c.curl)))
+        bending = builder.bending_loop(effect.stencil)
+        _add_rest_moment(bending, builder, c, bending.loop.load(builder.parameter(c.curl)))
 
 
-def creasing(low: Lowering, name: str, effect: CreasingBending, c: Coefficients) -> None:
-    """The same with a rest curvature that flows."""
-    _matrix(low, effect, c)
-    sheet, memory = low.sheet(effect.sheet), low.memory[f"effects.{name}"]
-    curl, mobility = (low.parameter(cast("Tensor", part)) for part in (c.curl, c.mobility))
-    fields = (curl, memory.now, mobility, low.dt, low.number(effect.yield_curvature))
-    after = sheet.loop.call("crease", sheet.curvature, *(sheet.loop.load(field) for field in fields))
-    sheet.loop.put(after[:3], memory.after)
-    _rest_moment(sheet, low, c, after[3:])
+@lowers(CreasingBending)
+def lower_creasing(builder: SubstepBuilder, name: str, effect: CreasingBending, c: Coefficients) -> None:
+    """Add bending with a rest curvature that flows."""
+    _add_plate_forces(builder, effect, c)
+    bending, memory = builder.bending_loop(effect.stencil), builder.memory[f"effects.{name}"]
+    curl, mobility = (builder.parameter(cast("Tensor", part)) for part in (c.curl, c.mobility))
+    fields = (curl, memory.now, mobility, builder.dt, builder.number(effect.yield_curvature))
+    after = bending.loop.call("crease", bending.curvature, *(bending.loop.load(field) for field in fields))
+    bending.loop.store(after[:3], memory.after)
+    _add_rest_moment(bending, builder, c, after[3:])
 
 
-def friction(low: Lowering, name: str, effect: BendingFriction, c: Tensor) -> None:
-    """Moment that opposes changes of curvature."""
-    sheet, memory = low.sheet(effect.sheet), low.memory[f"effects.{name}"]
-    fields = (memory.now, low.number(effect.threshold), low.parameter(c))
-    after = sheet.loop.call("bending_friction", sheet.curvature, *(sheet.loop.load(field) for field in fields))
-    sheet.loop.put(after[:6], memory.after)
-    sheet.moment(after[6:])
+@lowers(BendingFriction)
+def lower_bending_friction(builder: SubstepBuilder, name: str, effect: BendingFriction, c: Tensor) -> None:
+    """Add the moment that opposes changes of curvature."""
+    bending, memory = builder.bending_loop(effect.stencil), builder.memory[f"effects.{name}"]
+    fields = (memory.now, builder.number(effect.threshold), builder.parameter(c))
+    inputs = (bending.loop.load(field) for field in fields)
+    after = bending.loop.call("bending_friction", bending.curvature, *inputs)
+    bending.loop.store(after[:6], memory.after)
+    bending.add_moment(after[6:])
 
 
-def saturating(low: Lowering, name: str, effect: SaturatingBending, c: Saturating) -> None:
-    """On the second derivatives alone."""
-    sheet = low.sheet(effect.sheet)
-    values = [sheet.loop.load(low.parameter(value)) for value in (c.moment, c.curvature)]
-    sheet.stress(sheet.loop.call("saturating", sheet.second, *values))
+@lowers(SaturatingBending)
+def lower_saturating(builder: SubstepBuilder, name: str, effect: SaturatingBending, c: SaturatingCoefficients) -> None:
+    """Add the stress of a saturating moment on the second derivatives alone."""
+    bending = builder.bending_loop(effect.stencil)
+    values = [bending.loop.load(builder.parameter(value)) for value in (c.moment, c.curvature)]
+    bending.add_stress(bending.loop.call("saturating_bending", bending.second, *values))
 
 
-def _matrix(low: Lowering, effect: Bending, c: Coefficients) -> None:
-    """-Q (stiffness x + viscosity v); weights that are parameters need to know what they weighed."""
+def _add_plate_forces(builder: SubstepBuilder, effect: Bending, c: Coefficients) -> None:
+    """Add -Q (stiffness x + viscosity v); weights that are parameters need to know what they weighed."""
     if c.operator is None:
         columns = effect.columns.cpu().numpy()
-        weight = low.program.constant(effect.operator.reshape(-1, 1), near=len(columns))
+        weight = builder.program.constant(effect.operator.reshape(-1, 1), neighbours=len(columns))
     else:
-        columns = effect.woven.columns.cpu().numpy()
-        weight = low.parameter(c.operator, near=len(columns))
+        columns = effect.plate_operator.columns.cpu().numpy()
+        weight = builder.parameter(c.operator, neighbours=len(columns))
 
-    def straighten(kernel: str, inputs: Sequence[Field], force: Field) -> None:
-        bent = low.program.temporary(low.vertices, 3, kept=c.operator is not None)
-        loop = low.loop(low.vertices)
-        loop.put(loop.call(kernel, *(loop.load(field) for field in inputs)), bent)
-        low.program.stencil(columns, weight, bent, force, Shape.SYMMETRIC)
+    def add(kernel: str, inputs: Sequence[Field], force: Field) -> None:
+        operand = builder.program.temporary(builder.vertices, 3, is_recorded=c.operator is not None)
+        loop = builder.loop(builder.vertices)
+        loop.store(loop.call(kernel, *(loop.load(field) for field in inputs)), operand)
+        builder.program.stencil(columns, weight, operand, force, StencilForm.SYMMETRIC)
 
-    stiffness, viscosity = low.parameter(c.stiffness), low.parameter(c.viscosity)
-    if low.model.stages and effect.damping_time is not None:
-        straighten("scaled3", [stiffness, low.x.now], low.force)
-        low.viscous.append(lambda v, force: straighten("scaled3", [viscosity, v], force))
+    stiffness, viscosity = builder.parameter(c.stiffness), builder.parameter(c.viscosity)
+    if builder.model.stages and effect.damping_time is not None:
+        add("scale3", [stiffness, builder.x.now], builder.force)
+        builder.viscous_forces.append(lambda v, force: add("scale3", [viscosity, v], force))
     else:
-        straighten("bent", [stiffness, viscosity, low.x.now, low.v.now], low.force)
+        add("plate_operand", [stiffness, viscosity, builder.x.now, builder.v.now], builder.force)
 
 
-def _rest_moment(sheet: Sheet, low: Lowering, c: Coefficients, rest: list[int]) -> None:
-    plate = [sheet.loop.load(low.parameter(part)) for part in cast("Plate", c.plate)]
-    sheet.moment(sheet.loop.call("rest_moment", *plate, rest))
+def _add_rest_moment(bending: BendingLoop, builder: SubstepBuilder, c: Coefficients, rest: list[int]) -> None:
+    plate = [bending.loop.load(builder.parameter(part)) for part in cast("Plate", c.plate)]
+    bending.add_moment(bending.loop.call("rest_moment", *plate, rest))

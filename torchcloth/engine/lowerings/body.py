@@ -1,87 +1,91 @@
-"""Solid bodies: the response of ``boundaries/collider.py`` to what touches them."""
+"""Solid bodies: the response of ``boundaries/collider.py`` to the cloth that touches them."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Any
 
 import torch
 
 from ...boundaries import AbstractCollider, Coulomb, Elliptic, Stribeck
+from ..builder import SubstepBuilder, UnsupportedPart, lowering_of, lowers
 from ..fields import Field
 from ..loops import Loop
-from ..lowering import Lowering, Unfused
 from . import solids
 
 
-class Body:
-    """A collider in a program; its methods add to a loop.
+class BodyLowering:
+    """A collider in a program; its methods add instructions to a loop.
 
     Attributes:
-        steep: how much its distance may change along a way of length 1.
-        limits: [2] offset and recovery.
+        lipschitz: Lipschitz constant of its distance function.
+        limits: [2] offset [m] and recovery speed [m/s].
     """
 
-    def __init__(self, low: Lowering, name: str, solid: AbstractCollider) -> None:
-        law = _LAWS.get(type(solid.friction))
+    def __init__(self, builder: SubstepBuilder, name: str, solid: AbstractCollider) -> None:
+        law = lowering_of(solid.friction)
         if law is None:
-            raise Unfused(f"boundary {name!r} (friction {type(solid.friction).__name__})")
-        self._low, self._distance, self.steep = low, solids.distance(low, solid), solids.steepness(solid)
-        self._law, *self._numbers = law(low, solid.friction)
-        self.limits = low.program.constant(torch.tensor([[solid.offset, solid.recovery]], dtype=low.program.dtype))
-        self._place = _place(low, name, solid)
+            raise UnsupportedPart(f"boundary {name!r} (friction {type(solid.friction).__name__})")
+        self._builder, self._distance = builder, solids.distance_function(builder, solid)
+        self.lipschitz = solids.lipschitz_constant(solid)
+        self._law, *self._coefficients = law(builder, solid.friction)
+        limits = torch.tensor([[solid.offset, solid.recovery]], dtype=builder.program.dtype)
+        self.limits = builder.program.constant(limits)
+        self._pose = _pose_fields(builder, name, solid)
 
-    def seen(self, loop: Loop, x: list[int]) -> tuple[list[int], list[int] | None]:
-        """(distance and normal, in the body's axes; material velocity of the body, None: it stands still)."""
-        if self._place is None:
+    def distance_and_velocity(self, loop: Loop, x: list[int]) -> tuple[list[int], list[int] | None]:
+        """Return (distance and normal in the body's axes, velocity of the body at ``x`` or None if it stands still)."""
+        if self._pose is None:
             return self._distance(loop, x), None
-        placed = loop.call("place", x, *(loop.load(field) for field in (*self._place, self._low.dt)))
-        return self._distance(loop, placed[:3]), placed[3:]
+        place = loop.call("to_body_frame", x, *(loop.load(field) for field in (*self._pose, self._builder.dt)))
+        return self._distance(loop, place[:3]), place[3:]
 
-    def change(self, loop: Loop, x: list[int], v: list[int], air: list[int]) -> list[int]:
-        """Change of the velocities ``v`` at ``x``, exactly 0 where nothing touches; ``air`` per own mass goes along."""
-        contact, own = self.seen(loop, x)
-        if self._place is None or own is None:
-            return self._response(loop, v, contact, air)
-        pose = loop.load(self._place[1])
-        air = air and loop.call("tensor_inwards", air, pose)
-        return loop.call("outwards", self._response(loop, loop.call("inwards", v, own, pose), contact, air), pose)
+    def velocity_change(self, loop: Loop, x: list[int], v: list[int], added_mass_ratio: list[int]) -> list[int]:
+        """Return the change of the velocities ``v`` at ``x``, exactly 0 where nothing touches.
 
-    def _response(self, loop: Loop, slip: list[int], contact: list[int], air: list[int]) -> list[int]:
-        numbers = [loop.load(field) for field in (self._low.dt, self.limits, *self._numbers)]
-        law = f"{self._law}_in_air" if air else self._law
-        return loop.call(law, slip, contact, *numbers, air)
+        ``added_mass_ratio``: added mass over own mass; [] without.
+        """
+        contact, body_velocity = self.distance_and_velocity(loop, x)
+        if self._pose is None or body_velocity is None:
+            return self._response(loop, v, contact, added_mass_ratio)
+        pose = loop.load(self._pose[1])
+        ratio = added_mass_ratio and loop.call("tensor_to_body", added_mass_ratio, pose)
+        slip = loop.call("velocity_to_body", v, body_velocity, pose)
+        return loop.call("rotate_to_world", self._response(loop, slip, contact, ratio), pose)
+
+    def _response(self, loop: Loop, slip: list[int], contact: list[int], ratio: list[int]) -> list[int]:
+        inputs = [loop.load(field) for field in (self._builder.dt, self.limits, *self._coefficients)]
+        law = f"{self._law}_added_mass" if ratio else self._law
+        return loop.call(law, slip, contact, *inputs, ratio)
 
 
-def _place(low: Lowering, name: str, solid: AbstractCollider) -> tuple[Field, Field] | None:
-    """(increment, pose) of the shape; None when it stands still where it was given."""
-    own = None if solid.pose is None else low.program.constant(solid.pose.reshape(1, 16))
-    if name not in low.drives:
-        still = low.program.constant(torch.eye(4).reshape(1, 16))
-        return None if own is None else (still, own)
-    increment, pose, _ = low.drives[name]
-    if own is None:
+def _pose_fields(builder: SubstepBuilder, name: str, solid: AbstractCollider) -> tuple[Field, Field] | None:
+    """Fields (increment, pose) of the shape; None where it stands still in the world's axes."""
+    shape_pose = None if solid.pose is None else builder.program.constant(solid.pose.reshape(1, 16))
+    if name not in builder.prescribed:
+        identity = builder.program.constant(torch.eye(4).reshape(1, 16))
+        return None if shape_pose is None else (identity, shape_pose)
+    increment, pose, _ = builder.prescribed[name]
+    if shape_pose is None:
         return increment, pose
-    loop, composed = low.program.first(), low.program.temporary(1, 16)
-    loop.put(loop.call("compose", loop.load(pose), loop.load(own)), composed)
+    loop, composed = builder.program.setup_loop(), builder.program.temporary(1, 16)
+    loop.store(loop.call("compose_poses", loop.load(pose), loop.load(shape_pose)), composed)
     return increment, composed
 
 
-def _coulomb(low: Lowering, friction: Coulomb) -> tuple[Any, ...]:
-    return "coulomb", low.parameter(friction.field)
+@lowers(Coulomb)
+def lower_coulomb(builder: SubstepBuilder, friction: Coulomb) -> tuple[Any, ...]:
+    """Return (kernel, coefficient)."""
+    return "coulomb", builder.parameter(friction.field)
 
 
-def _stribeck(low: Lowering, friction: Stribeck) -> tuple[Any, ...]:
-    return "stribeck", *(low.parameter(part.field) for part in (friction, friction.excess, friction.speed))
+@lowers(Stribeck)
+def lower_stribeck(builder: SubstepBuilder, friction: Stribeck) -> tuple[Any, ...]:
+    """Return (kernel, coefficient of fast slip, excess at rest, speed)."""
+    return "stribeck", *(builder.parameter(part.field) for part in (friction, friction.excess, friction.speed))
 
 
-def _elliptic(low: Lowering, friction: Elliptic) -> tuple[Any, ...]:
-    axis = low.program.constant(friction.axis.reshape(1, 3))
-    return "elliptic", low.parameter(friction.field), low.parameter(friction.ratio.field), axis
-
-
-_LAWS: dict[type, Callable[[Lowering, Any], tuple[Any, ...]]] = {
-    Coulomb: _coulomb,
-    Elliptic: _elliptic,
-    Stribeck: _stribeck,
-}
+@lowers(Elliptic)
+def lower_elliptic(builder: SubstepBuilder, friction: Elliptic) -> tuple[Any, ...]:
+    """Return (kernel, coefficient along the axis, ratio of the one across to it, axis)."""
+    axis = builder.program.constant(friction.axis.reshape(1, 3))
+    return "elliptic", builder.parameter(friction.field), builder.parameter(friction.ratio.field), axis

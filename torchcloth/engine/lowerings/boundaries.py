@@ -1,86 +1,91 @@
-"""Boundaries: each takes the velocities that it finds and leaves those that obey it."""
+"""Boundaries: each takes the velocities before it and leaves velocities that obey it."""
 
 from __future__ import annotations
 
-from typing import Any, cast
+from typing import Any
 
-from ...boundaries import AbstractCollider, Box, Capsule, Cylinder, Grasp, MeshSolid, Plane, Sphere
+from ...boundaries import AbstractCollider, Grasp
 from ...effects import GripSlip
+from ..builder import SubstepBuilder, UnsupportedPart, VelocityStage, lowering_of
 from ..fields import Field
 from ..loops import Loop
-from ..lowering import Lowering, Unfused
-from ..shared_loops import Velocities
-from . import points
-from .body import Body
+from . import sample_points
+from .body import BodyLowering
 
 
-def lower(low: Lowering, velocity: Velocities) -> None:
-    """Add all boundaries to the program, in order, and what the driven ones give. dynamics.py, ``constrain``"""
-    parts = list(low.model.boundaries.items())
-    for k, (name, boundary) in enumerate(parts):
+def lower_boundaries(builder: SubstepBuilder, velocity: VelocityStage) -> None:
+    """Add all boundaries in order, and the impulses of the prescribed ones; ``dynamics/forces.py``, ``constrain``.
+
+    Raises:
+        UnsupportedPart: a boundary has no kernels.
+    """
+    boundaries = list(builder.model.boundaries.items())
+    for k, (name, boundary) in enumerate(boundaries):
         if type(boundary) is Grasp:
-            field = velocity.leave(drift=all(type(other) is Grasp for _, other in parts[k:]))
-            if name in low.drives:
-                _grasp(low, name, boundary, velocity, field)
+            field = velocity.to_field(drift=all(type(other) is Grasp for _, other in boundaries[k:]))
+            if name in builder.prescribed:
+                _add_grasp(builder, name, boundary, velocity, field)
             continue
-        if type(boundary) not in _SOLIDS:
-            raise Unfused(f"boundary {name!r} ({type(boundary).__name__})")
-        velocity.enter()
+        if not isinstance(boundary, AbstractCollider) or lowering_of(boundary) is None:
+            raise UnsupportedPart(f"boundary {name!r} ({type(boundary).__name__})")
+        velocity.to_registers()
         velocity.before = velocity.now
-        _collide(low, name, cast("AbstractCollider", boundary), velocity)
-        if name in low.drives:
-            _report(low, name, velocity.loop, None, velocity.before, velocity.now)
+        _add_collider(builder, name, boundary, velocity)
+        if name in builder.prescribed:
+            _add_impulse(builder, name, velocity.loop, None, velocity.before, velocity.now)
 
 
-def _grasp(low: Lowering, name: str, grasp: Grasp, velocity: Velocities, field: Field) -> None:
-    """On the held vertices alone, whose rows are overwritten; what they were is kept for the reverse sweep."""
-    rows, count, (increment, _, closed) = low.program.table(grasp.index), len(grasp.index), low.drives[name]
-    free = low.program.temporary(count, 3)
-    loop = low.loop(count)
-    loop.put(loop.load(field, rows), free)
-    loop = low.loop(count)
-    numbers = [loop.load(given) for given in (increment, low.dt, closed)]
-    held = loop.call("grasp", *numbers, loop.load(low.x.now, rows), loop.load(free))
-    for key, (effect, c) in low.model.effects.items():
+def _add_grasp(builder: SubstepBuilder, name: str, grasp: Grasp, velocity: VelocityStage, field: Field) -> None:
+    """Overwrite the rows of the grasped vertices alone; their earlier values are recorded for the reverse sweep."""
+    rows, count = builder.program.table(grasp.index), len(grasp.index)
+    increment, _, closed = builder.prescribed[name]
+    free = builder.program.temporary(count, 3)
+    loop = builder.loop(count)
+    loop.store(loop.load(field, rows), free)
+    loop = builder.loop(count)
+    inputs = [loop.load(f) for f in (increment, builder.dt, closed)]
+    grasped = loop.call("grasp_velocity", *inputs, loop.load(builder.x.now, rows), loop.load(free))
+    for key, (effect, c) in builder.model.effects.items():
         if effect.grasp != name:
             continue
         if type(effect) is not GripSlip:
-            raise Unfused(f"effect {key!r} ({type(effect).__name__})")
-        loop, held = _slip(low, rows, loop, free, held, c)
-    _report(low, name, loop, rows, loop.load(free), held)
-    velocity.overwrite(loop, rows, held)
+            raise UnsupportedPart(f"effect {key!r} ({type(effect).__name__})")
+        loop, grasped = _add_grip_slip(builder, rows, loop, free, grasped, c)
+    _add_impulse(builder, name, loop, rows, loop.load(free), grasped)
+    velocity.scatter_rows(loop, rows, grasped)
 
 
-def _collide(low: Lowering, name: str, solid: AbstractCollider, velocity: Velocities) -> None:
-    body = Body(low, name, solid)
+def _add_collider(builder: SubstepBuilder, name: str, solid: AbstractCollider, velocity: VelocityStage) -> None:
+    body = BodyLowering(builder, name, solid)
     if solid.points is not None:
-        points.collide(low, solid.points, body, velocity)
+        sample_points.add_point_contact(builder, solid.points, body, velocity)
     loop = velocity.loop
-    change = body.change(loop, loop.load(low.x.now), velocity.now, low.air_per_own(loop))
-    velocity.now = loop.call("plus3", velocity.now, change)
+    x, ratio = loop.load(builder.x.now), builder.added_mass_ratio(loop)
+    velocity.now = loop.call("add3", velocity.now, body.velocity_change(loop, x, velocity.now, ratio))
 
 
-def _slip(low: Lowering, rows: int, loop: Loop, free: Field, held: list[int], c: Any) -> tuple[Loop, list[int]]:
-    """(a new loop over the held vertices, their velocities in it)."""
-    masses = [low.mass] if low.resistance is None else [low.mass, low.resistance]
-    pull, *patch = (low.program.temporary(1, comps) for comps in (3, *(m.comps for m in masses)))
-    still = low.program.temporary(free.rows, 3)
-    loop.add(low.momentum(loop, loop.call("change", held, loop.load(free)), rows), pull)
-    for own, total in zip(masses, patch, strict=True):
-        loop.add(loop.load(own, rows), total)
-    loop.put(held, still)
-    loop = low.loop(free.rows)
-    fields = (pull, *patch, low.parameter(c.mobility), low.parameter(c.hold), low.dt)
-    law = "creep" if low.resistance is None else "creep_in_air"
-    return loop, loop.call(law, loop.load(still), *(loop.load(field) for field in fields))
+def _add_grip_slip(
+    builder: SubstepBuilder, rows: int, loop: Loop, free: Field, grasped: list[int], c: Any
+) -> tuple[Loop, list[int]]:
+    """Add the slip; returns a new loop over the grasped vertices, and registers of their velocities in it."""
+    masses = [builder.mass] if builder.added_mass is None else [builder.mass, builder.added_mass]
+    pull, *patch_masses = (builder.program.temporary(1, comps) for comps in (3, *(m.comps for m in masses)))
+    grasp_velocity = builder.program.temporary(free.rows, 3)
+    loop.add(builder.momentum(loop, loop.call("subtract3", grasped, loop.load(free)), rows), pull)
+    for mass, patch_mass in zip(masses, patch_masses, strict=True):
+        loop.add(loop.load(mass, rows), patch_mass)
+    loop.store(grasped, grasp_velocity)
+    loop = builder.loop(free.rows)
+    fields = (pull, *patch_masses, builder.parameter(c.mobility), builder.parameter(c.hold), builder.dt)
+    law = "grip_creep" if builder.added_mass is None else "grip_creep_added_mass"
+    return loop, loop.call(law, loop.load(grasp_velocity), *(loop.load(field) for field in fields))
 
 
-def _report(low: Lowering, name: str, loop: Loop, rows: int | None, before: list[int], after: list[int]) -> None:
-    """Impulse and its moment about the body."""
-    increment, pose, _ = low.drives[name]
-    momentum = low.momentum(loop, loop.call("change", after, before), rows)
-    place = loop.load(low.x.now, rows), loop.load(increment), loop.load(pose)
-    loop.add(loop.call("impulse", momentum, *place), low.impulses[name])
-
-
-_SOLIDS = (Box, Capsule, Cylinder, MeshSolid, Plane, Sphere)
+def _add_impulse(
+    builder: SubstepBuilder, name: str, loop: Loop, rows: int | None, before: list[int], after: list[int]
+) -> None:
+    """Add the impulse and its moment about the body's origin."""
+    increment, pose, _ = builder.prescribed[name]
+    momentum = builder.momentum(loop, loop.call("subtract3", after, before), rows)
+    place = loop.load(builder.x.now, rows), loop.load(increment), loop.load(pose)
+    loop.add(loop.call("impulse", momentum, *place), builder.impulses[name])

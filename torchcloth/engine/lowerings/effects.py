@@ -1,8 +1,7 @@
-"""Effects on the cloth."""
+"""Effects on vertices and triangles."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Any
 
 import torch
@@ -13,10 +12,7 @@ from ...effects import (
     AddedMass,
     Adhesion,
     AirDrag,
-    Bending,
-    BendingFriction,
     BodyForce,
-    CreasingBending,
     Gravity,
     GripSlip,
     KelvinVoigt,
@@ -24,116 +20,105 @@ from ...effects import (
     MassDamping,
     ResidualForce,
     RestShape,
-    SaturatingBending,
     ShearFriction,
 )
-from ...effects.residual import Coefficients as Residual
+from ...effects.residual import Coefficients as ResidualCoefficients
+from ..builder import SubstepBuilder, TriangleLoop, lowers
 from ..fields import Field
-from ..lowering import Lowering, Unfused
-from ..shared_loops import Triangles
-from . import bending
 
 
-def lower(low: Lowering, name: str, effect: AbstractEffect, c: Any) -> None:
-    """Add an effect to the program."""
-    part = _EFFECTS.get(type(effect))
-    if part is None:
-        raise Unfused(f"effect {name!r} ({type(effect).__name__})")
-    part(low, name, effect, c)
+@lowers(BodyForce, Gravity)
+def lower_weight(builder: SubstepBuilder, name: str, effect: AbstractEffect, c: Any) -> None:
+    """Add mass times acceleration."""
+    builder.add_vertex_force("weight", builder.mass, builder.parameter(c))
 
 
-def _weight(low: Lowering, name: str, effect: AbstractEffect, c: Any) -> None:
-    low.pull("weight", low.mass, low.parameter(c))
+@lowers(MassDamping)
+def lower_mass_damping(builder: SubstepBuilder, name: str, effect: MassDamping, c: Any) -> None:
+    """Add a drag in proportion to mass and velocity."""
+    builder.add_vertex_force("mass_damping", builder.parameter(c), builder.mass, builder.v.now)
 
 
-def _mass_damping(low: Lowering, name: str, effect: MassDamping, c: Any) -> None:
-    low.pull("mass_damping", low.parameter(c), low.mass, low.v.now)
+@lowers(Adhesion)
+def lower_adhesion(builder: SubstepBuilder, name: str, effect: Adhesion, c: Any) -> None:
+    """Add the attraction of a plane."""
+    plane = torch.cat([effect.point, effect.normal, effect.point.new_tensor([effect.gap])])[None]
+    constant = builder.program.constant
+    builder.add_vertex_force("adhesion", builder.x.now, builder.parameter(c), constant(effect.area), constant(plane))
 
 
-def _adhesion(low: Lowering, name: str, effect: Adhesion, c: Any) -> None:
-    plane = low.program.constant(torch.cat([effect.point, effect.normal, effect.point.new_tensor([effect.gap])])[None])
-    low.pull("adhesion", low.x.now, low.parameter(c), low.program.constant(effect.area), plane)
-
-
-def _air_drag(low: Lowering, name: str, effect: AirDrag, c: Any) -> None:
-    t = low.triangles
+@lowers(AirDrag)
+def lower_air_drag(builder: SubstepBuilder, name: str, effect: AirDrag, c: Any) -> None:
+    """Add the drag of air on the triangles."""
+    t = builder.triangles
     coefficients = [t.parameter(value) for value in (c.pressure, c.friction, c.wind)]
-    t.push("air_drag", *t.x, *t.v, *coefficients)
+    t.add_corner_forces("air_drag", *t.x, *t.v, *coefficients)
 
 
-def _added_mass(low: Lowering, name: str, effect: AddedMass, c: Any) -> None:
-    if low.resistance is None:
-        low.resistance = low.program.temporary(low.vertices, 6)
-    t = low.triangles
-    air = t.parameter(c)
-    inertia = t.loop.call("added_mass", air, t.normal, t.area)
-    for corner in low.corners:
-        t.loop.add(inertia, low.resistance, corner)
-    t.push("turning_air", t.surface[6:], *t.v, t.shape, t.area, air)
+@lowers(AddedMass)
+def lower_added_mass(builder: SubstepBuilder, name: str, effect: AddedMass, c: Any) -> None:
+    """Add the mass of the air that moves along, and its force as the normals turn."""
+    if builder.added_mass is None:
+        builder.added_mass = builder.program.temporary(builder.vertices, 6)
+    t = builder.triangles
+    density = t.parameter(c)
+    inertia = t.loop.call("added_mass", density, t.normal, t.area)
+    for corner in builder.corners:
+        t.loop.add(inertia, builder.added_mass, corner)
+    t.add_corner_forces("added_mass_turning", t.surface[6:], *t.v, t.shape, t.area, density)
 
 
-def _kelvin_voigt(low: Lowering, name: str, effect: KelvinVoigt, c: Any) -> None:
-    _strain_rate(low, c)
+@lowers(KelvinVoigt)
+def lower_kelvin_voigt(builder: SubstepBuilder, name: str, effect: KelvinVoigt, c: Any) -> None:
+    """Add the viscous stress of the strain rate."""
+    _add_viscous_stress(builder, c)
 
 
-def _strain_rate(low: Lowering, viscosity: Tensor) -> None:
-    def resist(t: Triangles, columns: list[int]) -> None:
-        t.stress(t.loop.call("kelvin_voigt", columns, *t.v, t.shape, t.parameter(viscosity)))
+@lowers(ShearFriction)
+def lower_shear_friction(builder: SubstepBuilder, name: str, effect: ShearFriction, c: Any) -> None:
+    """Add the stress of friction between the yarns."""
+    t, memory = builder.triangles, builder.memory[f"effects.{name}"]
+    threshold = t.loop.load(builder.number(effect.threshold))
+    after = t.loop.call("shear_friction", t.surface, t.loop.load(memory.now), threshold, t.parameter(c))
+    t.loop.store(after[:2], memory.after)
+    t.add_stress(after[2:])
 
-    columns = low.triangles.surface[:6]
-    if not low.model.stages:
-        return resist(low.triangles, columns)
-    strained = low.program.temporary(low.faces, 6)
-    low.triangles.loop.put(columns, strained)
 
-    def later(v: Field, force: Field) -> None:
-        triangles = Triangles(low, v, force)
-        resist(triangles, triangles.loop.load(strained))
+@lowers(ResidualForce)
+def lower_residual_force(builder: SubstepBuilder, name: str, effect: ResidualForce, c: ResidualCoefficients) -> None:
+    """Add local drag, viscous stress and bending moment, each where it has a coefficient."""
+    t = builder.triangles
+    if c.has_drag:
+        zero = t.loop.load(builder.number(0.0))
+        coefficients = [zero if part is None else t.parameter(part) for part in c[:4]]
+        t.add_corner_forces("local_drag", *t.x, *t.v, *coefficients, t.area)
+    if c.strain_rate is not None:
+        _add_viscous_stress(builder, c.strain_rate)
+    if c.bend is not None:
+        bending = builder.bending_loop(effect.stencil)
+        stiffness = bending.loop.load(builder.parameter(c.bend))
+        bending.add_moment(bending.loop.call("scale3", stiffness, bending.curvature))
+
+
+@lowers(GripSlip, LineMass, RestShape)
+def lower_without_force(builder: SubstepBuilder, name: str, effect: AbstractEffect, c: Any) -> None:
+    """Add nothing: the effect acts in a grasp, through the vertices' mass or through the rest shape alone."""
+
+
+def _add_viscous_stress(builder: SubstepBuilder, viscosity: Tensor) -> None:
+    def add(t: TriangleLoop, columns: list[int]) -> None:
+        t.add_stress(t.loop.call("kelvin_voigt", columns, *t.v, t.shape, t.parameter(viscosity)))
+
+    columns = builder.triangles.surface[:6]
+    if not builder.model.stages:
+        add(builder.triangles, columns)
+        return
+    deformation = builder.program.temporary(builder.faces, 6)
+    builder.triangles.loop.store(columns, deformation)
+
+    def add_in_stage(v: Field, force: Field) -> None:
+        triangles = TriangleLoop(builder, v, force)
+        add(triangles, triangles.loop.load(deformation))
         triangles.close()
 
-    low.viscous.append(later)
-
-
-def _shear_friction(low: Lowering, name: str, effect: ShearFriction, c: Any) -> None:
-    t, memory = low.triangles, low.memory[f"effects.{name}"]
-    threshold = t.loop.load(low.number(effect.threshold))
-    after = t.loop.call("shear_friction", t.surface, t.loop.load(memory.now), threshold, t.parameter(c))
-    t.loop.put(after[:2], memory.after)
-    t.stress(after[2:])
-
-
-def _residual(low: Lowering, name: str, effect: ResidualForce, c: Residual) -> None:
-    t = low.triangles
-    if c.has_drag:
-        none = t.loop.load(low.number(0.0))
-        laws = [none if part is None else t.parameter(part) for part in c[:4]]
-        t.push("local_drag", *t.x, *t.v, *laws, t.area)
-    if c.strain_rate is not None:
-        _strain_rate(low, c.strain_rate)
-    if c.bend is not None:
-        sheet = low.sheet(effect.stencil)
-        sheet.moment(sheet.loop.call("scaled3", sheet.loop.load(low.parameter(c.bend)), sheet.curvature))
-
-
-def _nothing(low: Lowering, name: str, effect: AbstractEffect, c: Any) -> None:
-    """It acts through the vertices' mass, the material's rest shape, or in a grasp, alone."""
-
-
-_EFFECTS: dict[type, Callable[[Lowering, str, Any, Any], None]] = {
-    AddedMass: _added_mass,
-    Adhesion: _adhesion,
-    AirDrag: _air_drag,
-    Bending: bending.plate,
-    BendingFriction: bending.friction,
-    BodyForce: _weight,
-    CreasingBending: bending.creasing,
-    Gravity: _weight,
-    GripSlip: _nothing,
-    KelvinVoigt: _kelvin_voigt,
-    LineMass: _nothing,
-    MassDamping: _mass_damping,
-    ResidualForce: _residual,
-    RestShape: _nothing,
-    SaturatingBending: bending.saturating,
-    ShearFriction: _shear_friction,
-}
+    builder.viscous_forces.append(add_in_stage)

@@ -1,64 +1,67 @@
-"""Membrane laws, from rest shapes other than the pattern."""
+"""Membrane laws, also from rest shapes other than the pattern.
+
+A material with a lowering here obeys ``DirectorMaterial``'s law across the sheet, which ``contact`` relies on.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import cast
 
 from ...materials import AEP, NormYield, OrthotropicAEP, StiffeningAEP
-from ..lowering import Lowering, Unfused
+from ..builder import SubstepBuilder, UnsupportedPart, lowering_of, lowers
 
 
-def lower(low: Lowering) -> None:
-    """Membrane stress of the triangles, as in ``strain.membrane_stress``."""
-    model, t = low.model, low.triangles
-    law = _LAWS.get(type(model.material))
+def lower_material(builder: SubstepBuilder) -> None:
+    """Add the membrane stress of the triangles, as ``dynamics.elasticity.membrane_stress`` computes it.
+
+    Raises:
+        UnsupportedPart: the material or its plasticity has no kernels.
+    """
+    model, t = builder.model, builder.triangles
+    law = lowering_of(model.material)
     if law is None:
-        raise Unfused(f"material {type(model.material).__name__}")
-    kernel, numbers = law(low)
-    if model.rest is None and "material" not in low.memory:
-        t.push(f"{kernel}_sheet", *t.x, t.shape, t.area, *numbers)
+        raise UnsupportedPart(f"material {type(model.material).__name__}")
+    kernel, coefficients = law(builder)
+    if model.inverse_rest_deformation is None and "material" not in builder.memory:
+        t.add_corner_forces(f"{kernel}_forces", *t.x, t.shape, t.area, *coefficients)
         return
-    seen, growth, lasting = t.surface, None, None
-    if model.rest is not None:
-        growth = t.parameter(model.rest)
-        seen = t.loop.call("seen_from", seen, growth)
-    if "material" in low.memory:
-        lasting = _flow(low, seen)
-        seen = t.loop.call("seen_from", seen, lasting)
-    columns = t.loop.call(kernel, seen, *numbers)
-    if lasting is not None:
-        columns = t.loop.call("pulled_back", columns, lasting)
+    surface, growth, plastic_set = t.surface, None, None
+    if model.inverse_rest_deformation is not None:
+        growth = t.parameter(model.inverse_rest_deformation)
+        surface = t.loop.call("elastic_deformation", surface, growth)
+    if "material" in builder.memory:
+        plastic_set = _update_plastic_set(builder, surface)
+        surface = t.loop.call("elastic_deformation", surface, plastic_set)
+    columns = t.loop.call(f"{kernel}_stress", surface, *coefficients)
+    if plastic_set is not None:
+        columns = t.loop.call("pull_back_stress", columns, plastic_set)
     if growth is not None:
-        columns = t.loop.call("grown", columns, growth)
-    t.stress(columns)
+        columns = t.loop.call("rest_deformation_pullback", columns, growth)
+    t.add_stress(columns)
 
 
-def _flow(low: Lowering, seen: list[int]) -> list[int]:
-    """The plastic set follows the surface."""
-    plastic = getattr(low.model.material, "plastic", None)
+def _update_plastic_set(builder: SubstepBuilder, surface: list[int]) -> list[int]:
+    plastic = getattr(builder.model.material, "plastic", None)
     if type(plastic) is not NormYield:
-        raise Unfused(f"plasticity {type(plastic).__name__}")
-    t, memory = low.triangles, low.memory["material"]
-    after = t.loop.call("norm_yield", seen, t.loop.load(memory.now), t.parameter(low.model.coefficients.limit))
-    t.loop.put(after, memory.after)
+        raise UnsupportedPart(f"plasticity {type(plastic).__name__}")
+    t, memory = builder.triangles, builder.memory["material"]
+    limit = t.parameter(builder.model.coefficients.limit)
+    after = t.loop.call("norm_yield", surface, t.loop.load(memory.now), limit)
+    t.loop.store(after, memory.after)
     return after
 
 
-def _isotropic(low: Lowering) -> tuple[str, list[list[int]]]:
-    t, c = low.triangles, low.model.coefficients
+@lowers(AEP)
+def lower_isotropic(builder: SubstepBuilder) -> tuple[str, list[list[int]]]:
+    """Return (name of the law, registers of its coefficients)."""
+    t, c = builder.triangles, builder.model.coefficients
     return "aep", [t.parameter(c.mu), t.parameter(c.lam)]
 
 
-def _orthotropic(low: Lowering) -> tuple[str, list[list[int]]]:
-    t, c = low.triangles, low.model.coefficients
-    numbers = [t.parameter(v) for v in (c.mu, c.lam, c.balance, c.warp, c.weft, c.warp_toe, c.weft_toe)]
-    reach = cast("OrthotropicAEP", low.model.material).stiffening_reach
-    return "orthotropic", [*numbers, t.loop.load(low.number(reach))]
-
-
-_LAWS: dict[type, Callable[[Lowering], tuple[str, list[list[int]]]]] = {
-    AEP: _isotropic,
-    OrthotropicAEP: _orthotropic,
-    StiffeningAEP: _orthotropic,
-}
+@lowers(OrthotropicAEP, StiffeningAEP)
+def lower_orthotropic(builder: SubstepBuilder) -> tuple[str, list[list[int]]]:
+    """Return (name of the law, registers of its coefficients)."""
+    t, c = builder.triangles, builder.model.coefficients
+    coefficients = [t.parameter(v) for v in (c.mu, c.lam, c.balance, c.warp, c.weft, c.warp_toe, c.weft_toe)]
+    reach = cast("OrthotropicAEP", builder.model.material).stiffening_reach
+    return "orthotropic", [*coefficients, t.loop.load(builder.number(reach))]

@@ -1,6 +1,6 @@
-"""Patches of neighbouring triangles, so that the search for layers need not look at all pairs.
+"""Patches of neighbouring triangles, so that the contact search need not look at all pairs.
 
-They are small against the way along the cloth from which on layers are seen.
+Patches are small against the distance along the cloth beyond which layers may touch.
 """
 
 from __future__ import annotations
@@ -12,55 +12,62 @@ from torch import Tensor
 from torch.utils.weak import WeakTensorKeyDictionary
 
 from ...dynamics.contact import Grid
-from ..stages import PATCH
+from ..enums import PATCH_TRIANGLES
 
 
 class Patches(NamedTuple):
-    """See csrc/search.h."""
+    """Patches of E triangles; see ``csrc/layer_search.h``.
 
-    order: np.ndarray  # [E] int32, patch by patch
-    starts: np.ndarray  # [patches + 1] int32
-    meet: np.ndarray  # [patches, patches] uint8: have triangles that are far from each other along the cloth
-    apart: np.ndarray  # [E, patches] uint8, ``Grid.apart`` in this order with a bit for each triangle of a patch
+    Attributes:
+        order: [E] int32, triangles patch by patch.
+        starts: [patches + 1] int32, where each patch begins in ``order``.
+        may_meet: [patches, patches] uint8, whether two patches have triangles that are far apart along the cloth.
+        non_adjacent: [E, patches] uint8, which triangles of a patch are far apart along the cloth: one bit for each.
+    """
+
+    order: np.ndarray
+    starts: np.ndarray
+    may_meet: np.ndarray
+    non_adjacent: np.ndarray
 
 
-_KNOWN: WeakTensorKeyDictionary = WeakTensorKeyDictionary()  # by ``Grid.apart``, which belongs to one mesh
+_cache: WeakTensorKeyDictionary = WeakTensorKeyDictionary()  # by ``Grid.non_adjacent``, which belongs to one mesh
 
 
-def patches(grid: Grid, corners: Tensor) -> Patches:
-    """Of a mesh with these corners [3, E]; no patches where all triangles always take part."""
-    if grid.apart is None:
+def patches_of(grid: Grid, corners: Tensor) -> Patches:
+    """Return the patches of a mesh with corners [3, E]; no patches where all triangles are always active."""
+    if grid.non_adjacent is None:
         return Patches(np.zeros(1, np.int32), np.zeros(1, np.int32), *[np.zeros((1, 1), np.uint8)] * 2)
-    if grid.apart not in _KNOWN:
-        _KNOWN[grid.apart] = _found(grid.apart.cpu().numpy(), corners.cpu().numpy())
-    return _KNOWN[grid.apart]
+    if grid.non_adjacent not in _cache:
+        _cache[grid.non_adjacent] = _build(grid.non_adjacent.cpu().numpy(), corners.cpu().numpy())
+    return _cache[grid.non_adjacent]
 
 
-def _found(apart: np.ndarray, corners: np.ndarray) -> Patches:
-    order, starts = _grown(corners)
+def _build(non_adjacent: np.ndarray, corners: np.ndarray) -> Patches:
+    order, starts = _grow_patches(corners)
     bit = (1 << np.arange(len(order)) - np.repeat(starts[:-1], np.diff(starts))).astype(np.uint8)
-    bits = np.add.reduceat(apart[np.ix_(order, order)] * bit, starts[:-1], axis=1, dtype=np.uint8)
-    meet = np.logical_or.reduceat(bits != 0, starts[:-1], axis=0)
-    return Patches(order, starts, (meet | meet.T).astype(np.uint8), bits)
+    bits = np.add.reduceat(non_adjacent[np.ix_(order, order)] * bit, starts[:-1], axis=1, dtype=np.uint8)
+    may_meet = np.logical_or.reduceat(bits != 0, starts[:-1], axis=0)
+    return Patches(order, starts, (may_meet | may_meet.T).astype(np.uint8), bits)
 
 
-def _grown(corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Each patch grows from the first triangle that is left, over common vertices."""
+def _grow_patches(corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Order and starts: each patch grows from the first unassigned triangle over common vertices."""
     around: list[list[int]] = [[] for _ in range(corners.max() + 1)]
     for triangle, vertices in enumerate(corners.T):
         for vertex in vertices:
             around[vertex].append(triangle)
-    left, order, starts = set(range(corners.shape[1])), [], [0]
+    unassigned, order, starts = set(range(corners.shape[1])), [], [0]
     for first in range(corners.shape[1]):
-        if first not in left:
+        if first not in unassigned:
             continue
         patch, k = [first], 0
-        left.discard(first)
+        unassigned.discard(first)
         while k < len(patch):
             for other in (t for vertex in corners[:, patch[k]] for t in around[vertex]):
-                if other in left and len(patch) < PATCH:
+                if other in unassigned and len(patch) < PATCH_TRIANGLES:
                     patch.append(other)
-                    left.discard(other)
+                    unassigned.discard(other)
             k += 1
         order += patch
         starts.append(len(order))

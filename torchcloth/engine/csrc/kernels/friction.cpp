@@ -5,7 +5,8 @@
 namespace tc {
 namespace {
 
-// Share z / Z after the strain has gone by path = change / threshold: share exp(-|path|) + path (1 - exp(-|path|)) / |path|.
+// Dahl's law: the friction z / Z after a change of strain by path = change / threshold is
+// z / Z exp(-|path|) + path (1 - exp(-|path|)) / |path|.
 template <class T>
 struct Dahl {
     T keep, pull;
@@ -17,32 +18,35 @@ struct Dahl {
     }
 };
 
-// Curvature now, curvature and share before, threshold, moment HB -> curvature, share, moment z.
+// Curvature, friction z / Z and moment after the substep, from curvature, curvature and z / Z before, threshold and the
+// largest moment.
 struct BendingFriction {
     static constexpr const char* name = "bending_friction";
     static constexpr int inputs = 11, outputs = 9;
-    static constexpr auto fixed = bits(9, 1);
+    static constexpr auto constant_inputs = input_bits(9, 1);
     template <class T>
     static constexpr void run(const T* in, T* out) {
-        Read<T> r{in};
+        Reader<T> r{in};
         const auto now = r.vec(), before = r.vec(), share = r.vec();
         const T threshold = r.number(), moment = r.number();
         const auto path = (now - before) / threshold;
         const Dahl<T> dahl(safe_norm(path));
         const auto after = dahl.keep * share + dahl.pull * path;
-        Write<T> w{out};
+        Writer<T> w{out};
         w.vec(now), w.vec(after), w.vec(moment * after);
     }
 };
+TC_KERNEL(BendingFriction)
 
-// f1, f2, cofactors, n, J, angle and share before, threshold, stress HG -> angle, share, stress columns.
+// Shear angle, friction z / Z and stress columns after the substep, from f1, f2, cofactors, n, J, angle and z / Z
+// before, threshold and the largest stress.
 struct ShearFriction {
     static constexpr const char* name = "shear_friction";
     static constexpr int inputs = 20, outputs = 8;
-    static constexpr auto fixed = bits(18, 1);
+    static constexpr auto constant_inputs = input_bits(18, 1);
     template <class T>
     static constexpr void run(const T* in, T* out) {
-        Read<T> r{in};
+        Reader<T> r{in};
         const auto f1 = r.vec(), f2 = r.vec(), c1 = r.vec(), c2 = r.vec();
         r.at += 3;
         const T J = r.number(), before = r.number(), share = r.number(), threshold = r.number(), stress = r.number();
@@ -51,14 +55,13 @@ struct ShearFriction {
         const Dahl<T> dahl(safe_sqrt(path * path));
         const T after = dahl.keep * share + dahl.pull * path;
         const T scale = stress * after / (sine * sine + J * J);
-        Write<T> w{out};
+        Writer<T> w{out};
         w.number(angle), w.number(after);
         w.vec(scale * (J * f2 - sine * c1)), w.vec(scale * (J * f1 - sine * c2));
     }
 };
+TC_KERNEL(ShearFriction)
 
 }  // namespace
-
-TC_KERNELS(friction_kernels, BendingFriction, ShearFriction)
 
 }  // namespace tc

@@ -1,39 +1,44 @@
-// All kernels of the engine. Each file of this folder gives its own, in a namespace without name: two structs of one name
-// in two files would be one. They are compiled side by side.
+// Registration of kernels. A file of this folder defines its kernels in a namespace without name, because two structs
+// of one name in two files would be one, and registers each by TC_KERNEL. The files are compiled in parallel.
 #pragma once
 
+#include <algorithm>
+#include <cstring>
 #include <vector>
 
 #include "../tape.h"
 
 namespace tc {
 
-template <class R> std::vector<Kernel<R>> surface_kernels();
-template <class R> std::vector<Kernel<R>> material_kernels();
-template <class R> std::vector<Kernel<R>> effect_kernels();
-template <class R> std::vector<Kernel<R>> bending_kernels();
-template <class R> std::vector<Kernel<R>> friction_kernels();
-template <class R> std::vector<Kernel<R>> boundary_kernels();
-template <class R> std::vector<Kernel<R>> contact_kernels();
-template <class R> std::vector<Kernel<R>> collider_kernels();
-template <class R> std::vector<Kernel<R>> shape_kernels();
-template <class R> std::vector<Kernel<R>> point_kernels();
-
 template <class R>
-std::vector<Kernel<R>> all_kernels() {
-    std::vector<Kernel<R>> all;
-    for (auto part : {surface_kernels<R>(), material_kernels<R>(), effect_kernels<R>(), bending_kernels<R>(),
-                      friction_kernels<R>(), boundary_kernels<R>(), collider_kernels<R>(), shape_kernels<R>(),
-                      point_kernels<R>(), contact_kernels<R>()})
-        all.insert(all.end(), part.begin(), part.end());
-    return all;
+std::vector<Kernel<R>>& registered_kernels() {
+    static std::vector<Kernel<R>> kernels;
+    return kernels;
 }
 
-// A file ends with TC_KERNELS(surface_kernels, Surface, Assemble, ...).
-template <class R, class... K>
-std::vector<Kernel<R>> listed() { return {kernel<K, R>()...}; }
-#define TC_KERNELS(name, ...)                                                          \
-    template <> std::vector<Kernel<float>> name<float>() { return listed<float, __VA_ARGS__>(); } \
-    template <> std::vector<Kernel<double>> name<double>() { return listed<double, __VA_ARGS__>(); }
+// A static object of this type registers a kernel when the library is loaded.
+template <class K>
+struct RegisterKernel {
+    RegisterKernel() {
+        registered_kernels<float>().push_back(kernel<K, float>());
+        registered_kernels<double>().push_back(kernel<K, double>());
+    }
+};
+#define TC_JOIN_(a, b) a##b
+#define TC_JOIN(a, b) TC_JOIN_(a, b)
+#define TC_KERNEL(...) [[maybe_unused]] const RegisterKernel<__VA_ARGS__> TC_JOIN(registered_, __COUNTER__){};
+
+// All kernels, sorted by name: their numbers do not depend on the order in which files are linked.
+template <class R>
+const std::vector<Kernel<R>>& all_kernels() {
+    static const std::vector<Kernel<R>> sorted = [] {
+        auto kernels = registered_kernels<R>();
+        std::sort(kernels.begin(), kernels.end(), [](const Kernel<R>& a, const Kernel<R>& b) {
+            return std::strcmp(a.name, b.name) < 0;
+        });
+        return kernels;
+    }();
+    return sorted;
+}
 
 }  // namespace tc

@@ -1,35 +1,36 @@
-// Membrane laws: torchcloth/materials and strain.py.
+// Membrane laws: torchcloth/materials and dynamics/elasticity.py.
 #include "kernels.h"
 #include "surface.h"
 
 namespace tc {
 namespace {
 
-// The surface seen from another rest shape: F -> F A with A by rows. strain.py
+// The elastic deformation F A, where A (by rows) leads from another rest shape to the pattern. dynamics/elasticity.py
 template <class T>
-struct Seen {
+struct Elastic {
     Vec<T> f1, f2;
     T J;
-    constexpr Seen(Vec<T> g1, Vec<T> g2, T ratio, const T* a)
+    constexpr Elastic(Vec<T> g1, Vec<T> g2, T ratio, const T* a)
         : f1(a[0] * g1 + a[2] * g2), f2(a[1] * g1 + a[3] * g2), J((a[0] * a[3] - a[1] * a[2]) * ratio) {}
 };
 
-// f1, f2, cofactors, n, J, A -> the same of F A.
-struct SeenFrom {
-    static constexpr const char* name = "seen_from";
+// f1, f2, cofactors, n and J of F A, from those of F, and A.
+struct ElasticDeformation {
+    static constexpr const char* name = "elastic_deformation";
     static constexpr int inputs = 20, outputs = 16;
     template <class T>
     static constexpr void run(const T* in, T* out) {
-        Read<T> r{in};
+        Reader<T> r{in};
         const auto f1 = r.vec(), f2 = r.vec();
         r.at += 6;
         const auto n = r.vec();
         const T J = r.number();
-        const Seen<T> s(f1, f2, J, r.at);
-        Write<T> w{out};
+        const Elastic<T> s(f1, f2, J, r.at);
+        Writer<T> w{out};
         w.vec(s.f1), w.vec(s.f2), w.vec(cross(s.f2, n)), w.vec(cross(n, s.f1)), w.vec(n), w.number(s.J);
     }
 };
+TC_KERNEL(ElasticDeformation)
 
 template <class T>
 struct Columns {
@@ -40,49 +41,51 @@ constexpr Columns<T> pulled_back(Columns<T> p, const T* a) {
     return {a[0] * p.p1 + a[1] * p.p2, a[2] * p.p1 + a[3] * p.p2};
 }
 
-// Stress columns of F A, A -> P A^T.
-struct PulledBack {
-    static constexpr const char* name = "pulled_back";
+// Stress columns P A^T, from those of F A, and A.
+struct PullBackStress {
+    static constexpr const char* name = "pull_back_stress";
     static constexpr int inputs = 10, outputs = 6;
     template <class T>
     static constexpr void run(const T* in, T* out) {
-        Read<T> r{in};
+        Reader<T> r{in};
         const auto p1 = r.vec(), p2 = r.vec();
         const auto p = pulled_back(Columns<T>{p1, p2}, r.at);
-        Write<T> w{out};
+        Writer<T> w{out};
         w.vec(p.p1), w.vec(p.p2);
     }
 };
+TC_KERNEL(PullBackStress)
 
-// Stress columns per true rest area, A = inverse growth -> P A^T / det A, per area of the pattern.
-struct Grown {
-    static constexpr const char* name = "grown";
+// Stress columns P A^T / det A per area of the pattern, from those per true rest area, and A, the inverse growth.
+struct RestDeformationPullback {
+    static constexpr const char* name = "rest_deformation_pullback";
     static constexpr int inputs = 10, outputs = 6;
     template <class T>
     static constexpr void run(const T* in, T* out) {
-        Read<T> r{in};
+        Reader<T> r{in};
         const auto p1 = r.vec(), p2 = r.vec();
         const T* a = r.at;
         const auto p = pulled_back(Columns<T>{p1, p2}, a);
-        const T share = 1.0 / (a[0] * a[3] - a[1] * a[2]);
-        Write<T> w{out};
-        w.vec(share * p.p1), w.vec(share * p.p2);
+        const T area_ratio = 1.0 / (a[0] * a[3] - a[1] * a[2]);
+        Writer<T> w{out};
+        w.vec(area_ratio * p.p1), w.vec(area_ratio * p.p2);
     }
 };
+TC_KERNEL(RestDeformationPullback)
 
-// f1, f2, cofactors, n, J, set A before, limit -> A after. materials/yielding.py
+// Plastic set A after the substep, from f1, f2, cofactors, n, J, A before and the limit. materials/yielding.py
 struct NormYield {
     static constexpr const char* name = "norm_yield";
     static constexpr int inputs = 21, outputs = 4;
     template <class T>
     static constexpr void run(const T* in, T* out) {
-        Read<T> r{in};
+        Reader<T> r{in};
         const auto f1 = r.vec(), f2 = r.vec();
         r.at += 9;
         const T J = r.number();
         const T* a = r.at;
         const T limit = a[4];
-        const Seen<T> s(f1, f2, J, a);
+        const Elastic<T> s(f1, f2, J, a);
         const T warp = dot(s.f1, s.f1), weft = dot(s.f2, s.f2), trace = sqrt(warp + weft + 2.0 * s.J);
         const T u11 = (warp + s.J) / trace, u22 = (weft + s.J) / trace, u12 = dot(s.f1, s.f2) / trace;
         const T e1 = u11 - 1.0, e2 = u22 - 1.0;
@@ -97,6 +100,7 @@ struct NormYield {
         }
     }
 };
+TC_KERNEL(NormYield)
 
 // materials/corotated.py with the cofactors (g_ff f1 - g_wf f2) / J: 2 mu (F - polar rotation) + pressure cof F.
 template <class T>
@@ -106,23 +110,23 @@ constexpr Stress<T> corotated(Metric<T> g, T mu, T pressure) {
     return {along + across * g.weft, along + across * g.warp, -(across * g.shear)};
 }
 
-// mu, lambda. materials/aep.py
+// Coefficients mu, lambda. materials/aep.py
 struct Isotropic {
-    static constexpr int numbers = 2;
+    static constexpr int coefficients = 2;
     template <class T>
     static constexpr Stress<T> stress(Metric<T> g, const T* c) { return corotated(g, c[0], c[1] * (g.J - 1.0)); }
 };
 
-// What stiffening adds to the tension. materials/stiffening.py
+// Tension of the stiffening weave. materials/stiffening.py
 template <class T>
 constexpr T stiffened(T modulus, T strain, T reach) {
     const T positive = at_least(strain, 0.0), curved = select(less(reach, positive), reach, positive);
     return modulus * curved * (curved + 2.0 * at_least(strain - reach, 0.0));
 }
 
-// mu, lambda, balance, warp, weft, their toes, reach. materials/orthotropic.py
+// Coefficients mu, lambda, balance, warp, weft, their stiffening, its reach. materials/orthotropic.py
 struct Orthotropic {
-    static constexpr int numbers = 8;
+    static constexpr int coefficients = 8;
     template <class T>
     static constexpr Stress<T> stress(Metric<T> g, const T* c) {
         const T mu = c[0], lam = c[1], balance = c[2], warp = c[3], weft = c[4], warp_toe = c[5], weft_toe = c[6], reach = c[7];
@@ -137,28 +141,29 @@ struct Orthotropic {
     }
 };
 
-// f1, f2, cofactors, n, J, the law's own numbers -> stress columns, for rest shapes other than the pattern.
+// Stress columns for rest shapes other than the pattern, from f1, f2, cofactors, n, J and the law's coefficients.
 template <class Law>
-struct OfSurface {
-    static constexpr int inputs = Surface::outputs + Law::numbers, outputs = 6;
+struct SurfaceStress {
+    static constexpr int inputs = Surface::outputs + Law::coefficients, outputs = 6;
     template <class T>
     static constexpr void run(const T* in, T* out) {
-        Read<T> r{in};
+        Reader<T> r{in};
         const auto f1 = r.vec(), f2 = r.vec();
         const Stress<T> s = Law::stress(Metric<T>{dot(f1, f1), dot(f2, f2), dot(f1, f2), in[15]}, in + 16);
-        Write<T> w{out};
+        Writer<T> w{out};
         w.vec(s.warp * f1 + s.shear * f2), w.vec(s.shear * f1 + s.weft * f2);
     }
 };
 
-struct IsotropicSheet : Sheet<Isotropic> { static constexpr const char* name = "aep_sheet"; };
-struct IsotropicColumns : OfSurface<Isotropic> { static constexpr const char* name = "aep"; };
-struct OrthotropicSheet : Sheet<Orthotropic> { static constexpr const char* name = "orthotropic_sheet"; };
-struct OrthotropicColumns : OfSurface<Orthotropic> { static constexpr const char* name = "orthotropic"; };
+struct IsotropicForces : CornerForces<Isotropic> { static constexpr const char* name = "aep_forces"; };
+TC_KERNEL(IsotropicForces)
+struct IsotropicStress : SurfaceStress<Isotropic> { static constexpr const char* name = "aep_stress"; };
+TC_KERNEL(IsotropicStress)
+struct OrthotropicForces : CornerForces<Orthotropic> { static constexpr const char* name = "orthotropic_forces"; };
+TC_KERNEL(OrthotropicForces)
+struct OrthotropicStress : SurfaceStress<Orthotropic> { static constexpr const char* name = "orthotropic_stress"; };
+TC_KERNEL(OrthotropicStress)
 
 }  // namespace
-
-TC_KERNELS(material_kernels, SeenFrom, PulledBack, Grown, NormYield, IsotropicSheet, IsotropicColumns, OrthotropicSheet,
-           OrthotropicColumns)
 
 }  // namespace tc

@@ -1,82 +1,86 @@
-// Contact points on triangles: torchcloth/boundaries/points.py.
+// Sample points on triangles that touch a body: torchcloth/boundaries/points.py.
 #include "kernels.h"
 #include "../vec.h"
 
 namespace tc {
 namespace {
 
-// Values at the corners, weights -> value at the point.
-struct AtPoint {
-    static constexpr const char* name = "at_point";
+// Value at a point, from the values at the corners and the barycentric weights.
+struct PointValue {
+    static constexpr const char* name = "point_value";
     static constexpr int inputs = 12, outputs = 3;
-    static constexpr auto fixed = bits(9, 3);
+    static constexpr auto constant_inputs = input_bits(9, 3);
     template <class T>
     static constexpr void run(const T* in, T* out) {
-        Read<T> r{in};
+        Reader<T> r{in};
         const auto a = r.vec(), b = r.vec(), c = r.vec();
-        Write<T>{out}.vec(r.at[0] * a + r.at[1] * b + r.at[2] * c);
+        Writer<T>{out}.vec(r.at[0] * a + r.at[1] * b + r.at[2] * c);
     }
 };
+TC_KERNEL(PointValue)
 
-// Distance, offset, recovery, velocity, that of the body -> distance to where it touches, speed.
-struct Reach {
-    static constexpr const char* name = "reach";
+// Distance to where a vertex touches and relative speed, from distance, offset, recovery, velocity and the body's
+// velocity.
+struct Approach {
+    static constexpr const char* name = "approach";
     static constexpr int inputs = 9, outputs = 2;
     template <class T>
     static constexpr void run(const T* in, T* out) {
-        Read<T> r{in};
+        Reader<T> r{in};
         const T distance = r.number(), offset = r.number();
         r.number();
         const auto v = r.vec();
-        Write<T> w{out};
+        Writer<T> w{out};
         w.number(distance - offset), w.number(safe_norm(v - r.vec()));
     }
 };
+TC_KERNEL(Approach)
 
-// Wanted changes of velocity below 1e-6 m/s are rounding.
+// 1 if a point touches: demanded changes of velocity below 1e-6 m/s are rounding.
 template <class T>
 constexpr T touches(Vec<T> change) { return less(1e-12, dot(change, change)); }
 
-// Wanted change at the point, weights -> how much of the corners' mass the point claims.
-struct Claim {
-    static constexpr const char* name = "claim";
+// Fractions of the corners' masses that a point claims, from its demanded change of velocity and its weights.
+struct ClaimMass {
+    static constexpr const char* name = "claim_mass";
     static constexpr int inputs = 6, outputs = 3;
     template <class T>
     static constexpr void run(const T* in, T* out) {
-        const T touching = touches(Read<T>{in}.vec());
+        const T touching = touches(Reader<T>{in}.vec());
         for (int k = 0; k < 3; k++) out[k] = touching * in[3 + k];
     }
 };
+TC_KERNEL(ClaimMass)
 
-// Weights, masses of the corners -> the first over the second.
-struct Light {
-    static constexpr const char* name = "light";
+// Weights over the masses of the corners.
+struct WeightPerMass {
+    static constexpr const char* name = "weight_per_mass";
     static constexpr int inputs = 6, outputs = 3;
-    static constexpr auto fixed = bits(0, 3);
+    static constexpr auto constant_inputs = input_bits(0, 3);
     template <class T>
     static constexpr void run(const T* in, T* out) {
         for (int k = 0; k < 3; k++) out[k] = in[k] / in[3 + k];
     }
 };
+TC_KERNEL(WeightPerMass)
 
-// Wanted change, weights over the corners' masses, claims on the corners -> changes of the corners.
-struct Shared {
-    static constexpr const char* name = "shared";
+// Changes of the corners' velocities, from the demanded change, the weights over masses and the claims on the corners.
+struct DistributeImpulse {
+    static constexpr const char* name = "distribute_impulse";
     static constexpr int inputs = 9, outputs = 9;
-    static constexpr auto fixed = bits(6, 3);
+    static constexpr auto constant_inputs = input_bits(6, 3);
     template <class T>
     static constexpr void run(const T* in, T* out) {
-        Read<T> r{in};
+        Reader<T> r{in};
         const auto change = r.vec(), weight = r.vec(), load = r.vec();
         const T touching = touches(change);
         const auto impulse = (touching / select(touching, dot(weight, load), 1.0)) * change;
-        Write<T> w{out};
+        Writer<T> w{out};
         w.vec(weight.x * impulse), w.vec(weight.y * impulse), w.vec(weight.z * impulse);
     }
 };
+TC_KERNEL(DistributeImpulse)
 
 }  // namespace
-
-TC_KERNELS(point_kernels, AtPoint, Reach, Claim, Light, Shared)
 
 }  // namespace tc

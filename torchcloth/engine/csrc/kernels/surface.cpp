@@ -1,143 +1,156 @@
-// The step itself, and the parts of a triangle's work, one by one.
+// The substep itself, and the kinematics of a triangle.
 #include "kernels.h"
 #include "surface.h"
 
 namespace tc {
 namespace {
 
-// What is left of a change of velocity in the air that moves along, so written that no air changes nothing, bitwise.
-// dynamics.py
+// A change of velocity as the added mass resists it, written such that zero added mass changes no bit.
+// dynamics/forces.py
 template <class T>
-constexpr Vec<T> resisted(Symmetric<T> air, T mass, Vec<T> change) {
+constexpr Vec<T> resist(Symmetric<T> air, T mass, Vec<T> change) {
     const auto b = air / mass;
     return change - solve(Symmetric<T>{b.xx + 1.0, b.xy, b.xz, b.yy + 1.0, b.yz, b.zz + 1.0}, b * change);
 }
 
-// Force, own mass, mass of the air if there is any -> change of velocity in unit time.
-template <bool AIR, class T>
-constexpr Vec<T> accelerated(Read<T>& r) {
+// Acceleration of force, mass and, if any, added mass.
+template <bool ADDED_MASS, class T>
+constexpr Vec<T> acceleration(Reader<T>& r) {
     const auto force = r.vec();
     const T mass = r.number();
-    if constexpr (AIR) return resisted(r.symmetric(), mass, force / mass);
+    if constexpr (ADDED_MASS) return resist(r.symmetric(), mass, force / mass);
     else return force / mass;
 }
 
-// dt, velocity, force, mass(es) -> velocity free of the boundaries.
-template <bool AIR>
-struct Kicked {
-    static constexpr int inputs = AIR ? 14 : 8, outputs = 3;
-    static constexpr auto fixed = bits(0, 1);
+// Velocity before the boundaries act, from dt, velocity, force, mass and added mass.
+template <bool ADDED_MASS>
+struct KickBy {
+    static constexpr int inputs = ADDED_MASS ? 14 : 8, outputs = 3;
+    static constexpr auto constant_inputs = input_bits(0, 1);
     template <class T>
     static constexpr void run(const T* in, T* out) {
-        Read<T> r{in};
+        Reader<T> r{in};
         const T dt = r.number();
         const auto v = r.vec();
-        Write<T>{out}.vec(v + dt * accelerated<AIR>(r));
+        Writer<T>{out}.vec(v + dt * acceleration<ADDED_MASS>(r));
     }
 };
-struct Kick : Kicked<false> { static constexpr const char* name = "kick"; };
-struct KickInAir : Kicked<true> { static constexpr const char* name = "kick_in_air"; };
+struct Kick : KickBy<false> { static constexpr const char* name = "kick"; };
+TC_KERNEL(Kick)
+struct KickAddedMass : KickBy<true> { static constexpr const char* name = "kick_added_mass"; };
+TC_KERNEL(KickAddedMass)
 
-// dt, w_0, w_1, how often held, velocity, before, viscous force, mass(es) -> the next Chebyshev polynomial of velocities.
-// relaxation.py
-template <bool AIR>
-struct Staged {
-    static constexpr int inputs = AIR ? 20 : 14, outputs = 3;
-    static constexpr auto fixed = bits(0, 4);
+// The next Chebyshev polynomial of velocities, from dt, w_0, w_1, count of grips, velocity, velocity before, viscous
+// force, mass and added mass. dynamics/viscous_stages.py
+template <bool ADDED_MASS>
+struct ViscousStageBy {
+    static constexpr int inputs = ADDED_MASS ? 20 : 14, outputs = 3;
+    static constexpr auto constant_inputs = input_bits(0, 4);
     template <class T>
     static constexpr void run(const T* in, T* out) {
-        Read<T> r{in};
-        const T dt = r.number(), first = r.number(), slope = r.number(), held = r.number();
+        Reader<T> r{in};
+        const T dt = r.number(), first = r.number(), slope = r.number(), grips = r.number();
         const auto v = r.vec(), before = r.vec();
-        const T share = select(less(held, 0.5), slope * dt, 0.0);
-        Write<T>{out}.vec(first * v + share * accelerated<AIR>(r) - before);
+        const T factor = select(less(grips, 0.5), slope * dt, 0.0);
+        Writer<T>{out}.vec(first * v + factor * acceleration<ADDED_MASS>(r) - before);
     }
 };
-struct Stage : Staged<false> { static constexpr const char* name = "stage"; };
-struct StageInAir : Staged<true> { static constexpr const char* name = "stage_in_air"; };
+struct ViscousStage : ViscousStageBy<false> { static constexpr const char* name = "viscous_stage"; };
+TC_KERNEL(ViscousStage)
+struct ViscousStageAddedMass : ViscousStageBy<true> { static constexpr const char* name = "viscous_stage_added_mass"; };
+TC_KERNEL(ViscousStageAddedMass)
 
-// Mass of the air, own mass, change of velocity -> what the two were given. dynamics.py
-struct Loaded {
-    static constexpr const char* name = "loaded";
+// Momentum that added mass and mass take with a change of velocity. dynamics/forces.py
+struct MomentumAddedMass {
+    static constexpr const char* name = "momentum_added_mass";
     static constexpr int inputs = 10, outputs = 3;
     template <class T>
     static constexpr void run(const T* in, T* out) {
-        Read<T> r{in};
+        Reader<T> r{in};
         const auto air = r.symmetric();
         const T mass = r.number();
         const auto change = r.vec();
-        Write<T>{out}.vec(mass * change + air * change);
+        Writer<T>{out}.vec(mass * change + air * change);
     }
 };
+TC_KERNEL(MomentumAddedMass)
 
 // A vector times a number.
-struct Scaled {
-    static constexpr const char* name = "scaled3";
+struct Scale {
+    static constexpr const char* name = "scale3";
     static constexpr int inputs = 4, outputs = 3;
     template <class T>
     static constexpr void run(const T* in, T* out) {
-        Read<T> r{in};
+        Reader<T> r{in};
         const T scale = r.number();
-        Write<T>{out}.vec(scale * r.vec());
+        Writer<T>{out}.vec(scale * r.vec());
     }
 };
+TC_KERNEL(Scale)
 
 // Sum of two vectors.
-struct Plus {
-    static constexpr const char* name = "plus3";
+struct Add {
+    static constexpr const char* name = "add3";
     static constexpr int inputs = 6, outputs = 3;
     template <class T>
     static constexpr void run(const T* in, T* out) {
-        Read<T> r{in};
+        Reader<T> r{in};
         const auto a = r.vec();
-        Write<T>{out}.vec(a + r.vec());
+        Writer<T>{out}.vec(a + r.vec());
     }
 };
+TC_KERNEL(Add)
 
-// dt, position, velocity -> position.
+// Position after the substep, from dt, position and velocity.
 struct Drift {
     static constexpr const char* name = "drift";
     static constexpr int inputs = 7, outputs = 3;
-    static constexpr auto fixed = bits(0, 1);
+    static constexpr auto constant_inputs = input_bits(0, 1);
     template <class T>
     static constexpr void run(const T* in, T* out) {
-        Read<T> r{in};
+        Reader<T> r{in};
         const T dt = r.number();
         const auto x = r.vec(), v = r.vec();
-        Write<T>{out}.vec(x + dt * v);
+        Writer<T>{out}.vec(x + dt * v);
     }
 };
+TC_KERNEL(Drift)
 
-// The same with what was lost of earlier steps, as it was too small to be added to the position -> position, what is lost
-// now (Kahan 1965). Derivatives are those of what is added up.
-struct DriftOn {
-    static constexpr const char* name = "drift_on";
+// Position and compensation after the substep: compensated summation (Kahan 1965) of dt, position, velocity and
+// compensation. Derivatives are those of the plain sum.
+struct DriftCompensated {
+    static constexpr const char* name = "drift_compensated";
     static constexpr int inputs = 10, outputs = 6;
-    static constexpr auto fixed = bits(0, 1) | bits(7, 3);
+    static constexpr auto constant_inputs = input_bits(0, 1) | input_bits(7, 3);
     template <class T>
     static constexpr void run(const T* in, T* out) {
-        Read<T> r{in};
+        Reader<T> r{in};
         const T dt = r.number();
         const auto x = r.vec(), v = r.vec();
-        const auto way = dt * v + r.vec();
-        const auto after = x + way;
-        Write<T> w{out};
-        w.vec(after), w.vec(way - (after - x));
+        const auto change = dt * v + r.vec();
+        const auto after = x + change;
+        Writer<T> w{out};
+        w.vec(after), w.vec(change - (after - x));
     }
 };
+TC_KERNEL(DriftCompensated)
 
-// Numbers go from one place to another, or are added there.
+// Copies of numbers, which a loop may add to a register.
 template <int N>
-struct Copied {
+struct CopyOf {
     static constexpr int inputs = N, outputs = N;
     template <class T>
     static constexpr void run(const T* in, T* out) { for (int i = 0; i < N; i++) out[i] = 1.0 * in[i]; }
 };
-struct Copy : Copied<3> { static constexpr const char* name = "copy3"; };
-struct CopyStress : Copied<15> { static constexpr const char* name = "copy15"; };
+struct Copy : CopyOf<3> { static constexpr const char* name = "copy3"; };
+TC_KERNEL(Copy)
+struct CopyStress : CopyOf<15> { static constexpr const char* name = "copy15"; };
+TC_KERNEL(CopyStress)
+
+TC_KERNEL(Surface)
+TC_KERNEL(CompensatedEdges)
+TC_KERNEL(AssembleForces)
 
 }  // namespace
-
-TC_KERNELS(surface_kernels, Surface, Edges, Assemble, Kick, KickInAir, Stage, StageInAir, Loaded, Scaled, Plus, Drift, DriftOn, Copy, CopyStress)
 
 }  // namespace tc

@@ -1,4 +1,5 @@
-// exp, expm1 and atan2 of packs, right to the last digit or two: polynomials, so that no lane waits for a library call.
+// exp, expm1 and atan2 of packs, accurate to one or two units in the last place. They are polynomials, so that no lane
+// waits for a library call.
 #pragma once
 
 #include "pack.h"
@@ -26,8 +27,9 @@ struct Format<double> {
                                       0.039230447784793095235, -0.019175404711104933678};
 };
 
-// x = k ln 2 + r with |r| <= ln 2 / 2: gives 2^k and exp(r) - 1. The quotient is rounded by adding a number so large that
-// no fraction is left; ln 2 has two parts, so that k times the first is exact. Beyond the range, the end of the range.
+// Splits x = k ln 2 + r with |r| <= ln 2 / 2 into 2^k and exp(r) - 1. Adding a number so large that it has no fraction
+// rounds the quotient. ln 2 has two parts, so that k times the first is exact. Beyond the range, the end of the range
+// counts.
 template <class R, int L>
 inline void split_exp(Pack<R, L> x, Pack<R, L>& power, Pack<R, L>& rest) {
     using P = Pack<R, L>;

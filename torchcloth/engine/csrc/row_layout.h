@@ -1,5 +1,5 @@
-// Between rows of memory and packs: fields of several components lie row by row, four numbers at a time, and are
-// turned about in registers. Single numbers lie side by side.
+// Conversion between rows of memory and packs. Fields of several components lie row by row, four numbers at a time, and
+// are transposed in registers. Fields of one component lie contiguously.
 #pragma once
 
 #include "pack.h"
@@ -12,7 +12,7 @@ using Quad = Pack<R, 4>;
 constexpr int round_up(int n, int to) { return (n + to - 1) / to * to; }
 constexpr int pitch_of(int comps) { return comps == 1 ? 1 : round_up(comps, 4); }
 
-// Four packs whose chunks of four lanes are rows, into packs of one component each; its own inverse.
+// Transposes four packs whose chunks of four lanes are rows into packs of one component each; it is its own inverse.
 inline void transpose(Pack<float, 16>* r) {
     typedef Pack<float, 16>::Lanes V;
 #define TC_LANES(a, b, c, d) a, b, c, d, a + 4, b + 4, c + 4, d + 4, a + 8, b + 8, c + 8, d + 8, a + 12, b + 12, c + 12, d + 12
@@ -40,12 +40,12 @@ inline void transpose(Pack<double, 8>* r) {
 #undef TC_LANES
 }
 
-inline Pack<float, 16> joined(Quad<float> a, Quad<float> b, Quad<float> c, Quad<float> d) {
+inline Pack<float, 16> concatenate(Quad<float> a, Quad<float> b, Quad<float> c, Quad<float> d) {
     const auto low = __builtin_shufflevector(a.v, b.v, 0, 1, 2, 3, 4, 5, 6, 7);
     const auto high = __builtin_shufflevector(c.v, d.v, 0, 1, 2, 3, 4, 5, 6, 7);
     return Pack<float, 16>(__builtin_shufflevector(low, high, 0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15));
 }
-inline Pack<double, 8> joined(Quad<double> a, Quad<double> b) {
+inline Pack<double, 8> concatenate(Quad<double> a, Quad<double> b) {
     return Pack<double, 8>(__builtin_shufflevector(a.v, b.v, 0, 1, 2, 3, 4, 5, 6, 7));
 }
 
@@ -58,21 +58,21 @@ inline Quad<double> chunk(Pack<double, 8> r) {
     return Quad<double>(__builtin_shufflevector(r.v, r.v, 4 * Q, 4 * Q + 1, 4 * Q + 2, 4 * Q + 3));
 }
 
-// row(lane) is where a lane's four numbers lie.
+// row(lane) returns where a lane's four numbers lie.
 template <class F>
 inline void gather_quads(F row, Pack<float, 16>* r) {
     auto at = [&](int lane) { return *reinterpret_cast<const Quad<float>*>(row(lane)); };
-    for (int j = 0; j < 4; j++) r[j] = joined(at(j), at(4 + j), at(8 + j), at(12 + j));
+    for (int j = 0; j < 4; j++) r[j] = concatenate(at(j), at(4 + j), at(8 + j), at(12 + j));
     transpose(r);
 }
 template <class F>
 inline void gather_quads(F row, Pack<double, 8>* r) {
     auto at = [&](int lane) { return *reinterpret_cast<const Quad<double>*>(row(lane)); };
-    for (int j = 0; j < 4; j++) r[j] = joined(at(j), at(4 + j));
+    for (int j = 0; j < 4; j++) r[j] = concatenate(at(j), at(4 + j));
     transpose(r);
 }
 
-// give(lane, four numbers) for every lane in order; spoils r.
+// Calls give(lane, four numbers) for every lane in order; destroys r.
 template <class F>
 inline void scatter_quads(Pack<float, 16>* r, F give) {
     transpose(r);

@@ -25,8 +25,8 @@ def falling(density):
 
 @pytest.mark.parametrize("at", [0, 1, 7])
 def test_an_interrupted_program_is_made_anew(monkeypatch, at):
-    """Half of one, kept for later, would be a cloth without gravity, or a crash."""
-    monkeypatch.setattr(program, "_KEPT", type(program._KEPT)())
+    """Half of one, saved for later, would be a cloth without gravity, or a crash."""
+    monkeypatch.setattr(program, "_cache", type(program._cache)())
     call, made = program.Program._call, []
 
     def interrupted(self, name, *arguments):
@@ -46,7 +46,7 @@ def test_an_interrupted_program_is_made_anew(monkeypatch, at):
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="nothing forks here")
 def test_a_fork_does_not_wait_for_a_thread_that_it_has_not():
     """Another thread of the parent was just handing a program over."""
-    with program._KEEPING:
+    with program._cache_lock:
         child = os.fork()
         if child == 0:
             signal.alarm(30)
@@ -66,18 +66,18 @@ def test_records_may_come_back_from_elsewhere():
         place[...] = tensor.numpy()
         return place
 
-    def back(kept):
-        return torch.from_numpy(kept) if isinstance(kept, np.ndarray) else kept
+    def back(saved):
+        return torch.from_numpy(saved) if isinstance(saved, np.ndarray) else saved
 
     mesh = tc.meshes.rectangle(0.1, 0.1, resolution=(5, 5))
     cloth = tc.Cloth(mesh, tc.materials.AEP(1e5), 0.2, {"g": tc.effects.Gravity()}, contact=None, engine="fused")
-    found = []
+    results = []
     for hooks in (nullcontext(), torch.autograd.graph.saved_tensors_hooks(away, back)):
         x = cloth.rest_state().x.clone().requires_grad_()
         with hooks:
             out = cloth(cloth.state(x), times=[0.0, 0.005]).x[-1]
-        found.append(torch.autograd.grad(out.square().sum(), x)[0])
-    assert torch.equal(*found)
+        results.append(torch.autograd.grad(out.square().sum(), x)[0])
+    assert torch.equal(*results)
 
 
 SHORT = """

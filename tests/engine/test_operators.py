@@ -7,8 +7,8 @@ from helpers.engine_cloths import close, opening, sheet, start
 from torch.func import functional_call, hessian, jacfwd, jacrev, jvp, vjp, vmap
 
 import torchcloth as tc
-from torchcloth.engine.dispatch import still_drives
-from torchcloth.engine.fused import Fused
+from torchcloth.engine.dispatch import stationary_prescribed
+from torchcloth.engine.fused import FusedEngine
 from torchcloth.engine.operators import Rollout, ops
 from torchcloth.errors import InvalidInput
 from torchcloth.testing import check_gradients
@@ -26,9 +26,9 @@ def call(request):
 def program(dtype, batch=()):
     cloth = sheet("fused").to(dtype)
     state = start(cloth, batch)
-    model = cloth.model()
-    drives = still_drives(model, STEPS)
-    job = Fused(model, state, drives).job(state, torch.full((STEPS,), 1e-4), drives)
+    model = cloth.build_model()
+    prescribed = stationary_prescribed(model, STEPS)
+    job = FusedEngine(model, state, prescribed).job(state, torch.full((STEPS,), 1e-4), prescribed)
     return job.program, [tensor.detach() for tensor in job.inputs.values()]
 
 
@@ -69,16 +69,16 @@ def test_fakes_have_the_real_shapes(call):
 def test_gradients_by_autograd_of_the_operator_and_of_the_function(call):
     """With records, with coarse ones, and with none, where the adjoint goes through the substeps itself."""
     known, inputs = call
-    found = []
+    results = []
     for run in (ops.rollout, lambda n, k, e, values: Rollout.apply(n, k, e, *values)):
         for every in (1, 2, 0):
             mine = leaves(inputs)
             *results, _ = run(known.number, STEPS, every, mine)
             torch.manual_seed(0)
             loss = sum((r * torch.randn_like(r)).sum() for r in results)
-            found.append(torch.autograd.grad(loss, mine))
-    for other in found[1:]:
-        for a, b in zip(found[0], other, strict=True):
+            results.append(torch.autograd.grad(loss, mine))
+    for other in results[1:]:
+        for a, b in zip(results[0], other, strict=True):
             torch.testing.assert_close(a, b)
 
 
@@ -155,8 +155,8 @@ def test_vmap_equals_a_loop(mapped):
         alone = [function(*(t[k] for t in many.values())) for k in range(3)]
         if not isinstance(together, tuple):
             together, alone = (together,), [(a,) for a in alone]
-        for part, own in zip(together, zip(*alone, strict=True), strict=True):
-            close(part, torch.stack(own), 1e-10, function.__name__)
+        for part, single in zip(together, zip(*alone, strict=True), strict=True):
+            close(part, torch.stack(single), 1e-10, function.__name__)
 
 
 def test_what_is_too_short_is_not_read_beyond():
@@ -222,7 +222,7 @@ def test_sweep_over_a_rollout():
 @pytest.mark.parametrize("way", ["forward_ad", "torch.func.jvp"])
 def test_forward_mode_through_a_cloth(way):
     """Against the reference, and against a gradient."""
-    motion, found = opening(END), []
+    motion, results = opening(END), []
     for engine in ("fused", "reference"):
         run, state = simulation(sheet(engine), motion)
         torch.manual_seed(0)
@@ -231,10 +231,10 @@ def test_forward_mode_through_a_cloth(way):
         if way == "forward_ad":
             with forward_ad.dual_level():
                 pair = forward_ad.make_dual(state.x, dx), forward_ad.make_dual(motion["left"].pose, shift)
-                found.append(forward_ad.unpack_dual(run(*pair)).tangent.clone())
+                results.append(forward_ad.unpack_dual(run(*pair)).tangent.clone())
         else:
-            found.append(jvp(run, (state.x, motion["left"].pose), (dx, shift))[1])
-    close(*found, 1e-8, "tangent")
+            results.append(jvp(run, (state.x, motion["left"].pose), (dx, shift))[1])
+    close(*results, 1e-8, "tangent")
 
 
 def test_jvp_of_a_number_of_steps_in_one_program():
@@ -244,12 +244,12 @@ def test_jvp_of_a_number_of_steps_in_one_program():
         second.material.youngs_modulus.set(2e5)
     numbers = set()
     for cloth in (first, second, first):
-        model, state = cloth.model(), cloth.rest_state()
-        numbers.add(Fused(model, state, still_drives(model)).low.program.number)
+        model, state = cloth.build_model(), cloth.rest_state()
+        numbers.add(FusedEngine(model, state, stationary_prescribed(model)).builder.program.number)
     assert len(numbers) == 1
     second.boundaries["left"].index = torch.tensor([2])  # a constant of a part
-    model = second.model()
-    numbers.add(Fused(model, state, still_drives(model)).low.program.number)
+    model = second.build_model()
+    numbers.add(FusedEngine(model, state, stationary_prescribed(model)).builder.program.number)
     assert len(numbers) == 2
 
 

@@ -1,5 +1,5 @@
-// The five derivatives of a field of vectors at every vertex, and what forces on them do to the vertices: a Stencil with
-// constant weights, five at a time. Both directions gather, so that nothing waits for what was just written.
+// The five derivatives of a field of vectors at every vertex, and the transpose of this operator: a Stencil with
+// constant weights, five at a time. Both directions gather, so that no addition waits for an earlier store.
 #pragma once
 
 #include <array>
@@ -9,15 +9,15 @@
 
 namespace tc {
 
-// The vertices that each vertex sees, one vertex after the other, with eight numbers each: five weights, three zeros.
+// A sparse matrix by rows (CSR): the neighbours of each vertex, with eight numbers each: five weights and three zeros.
 template <class R>
-struct Links {
+struct CsrLinks {
     std::vector<int> first, other;
     Buffer<R> weight;
 
     using Rows = std::vector<std::vector<std::pair<int, std::array<double, 5>>>>;
 
-    explicit Links(const Rows& rows) : first{0} {
+    explicit CsrLinks(const Rows& rows) : first{0} {
         for (const auto& row : rows) {
             for (const auto& link : row) other.push_back(link.first);
             first.push_back(int(other.size()));
@@ -33,60 +33,60 @@ struct Links {
 };
 
 template <class R>
-struct BothWays {
-    std::unique_ptr<Links<R>> seeing, seen;
+struct StencilAndTranspose {
+    std::unique_ptr<CsrLinks<R>> forward, transpose;
 
-    BothWays(const Program<R>& p, int table, int weight) {
+    StencilAndTranspose(const Program<R>& p, int table, int weight) {
         const Field& f = p.fields[weight];
-        typename Links<R>::Rows to(f.vertices), from(f.vertices);
+        typename CsrLinks<R>::Rows to(f.vertices), from(f.vertices);
         for (int v = 0; v < f.vertices; v++) {
             std::array<double, 5> sum{};
-            for (int n = 0; n < f.near; n++) {
+            for (int n = 0; n < f.neighbours; n++) {
                 const int other = p.tables[table][size_t(n) * f.vertices + v];
                 if (other == v) continue;  // rows are filled up with the vertex itself
                 std::array<double, 5> w, minus;
                 for (int c = 0; c < 5; c++) {
-                    w[c] = p.constants[weight].data[f.place((size_t(c) * f.near + n) * f.vertices + v)];
+                    w[c] = p.constants[weight].data[f.place((size_t(c) * f.neighbours + n) * f.vertices + v)];
                     sum[c] += w[c], minus[c] = -w[c];
                 }
                 to[v].push_back({other, w}), from[other].push_back({v, minus});
             }
             from[v].push_back({v, sum});
         }
-        seeing = std::make_unique<Links<R>>(to), seen = std::make_unique<Links<R>>(from);
+        forward = std::make_unique<CsrLinks<R>>(to), transpose = std::make_unique<CsrLinks<R>>(from);
     }
 };
 
 template <class R>
-struct Derivatives : Stage<R> {
+struct SurfaceDerivatives : Stage<R> {
     using Row = Pack<R, 16>;  // five vectors and a zero
     const Program<R>& program;
-    std::shared_ptr<const BothWays<R>> links;
+    std::shared_ptr<const StencilAndTranspose<R>> links;
     int weight, x, y;  // y has 15 components
     bool transposed;
 
-    Derivatives(const Program<R>& p, std::shared_ptr<const BothWays<R>> links, int weight, int x, int y, bool transposed)
+    SurfaceDerivatives(const Program<R>& p, std::shared_ptr<const StencilAndTranspose<R>> links, int weight, int x, int y, bool transposed)
         : program(p), links(std::move(links)), weight(weight), x(x), y(y), transposed(transposed) {}
 
     static bool fits(const Program<R>& p, int weight, int y) {
-        return p.fields[weight].kind == Kind::constant && p.fields[y].comps == 15;
+        return p.fields[weight].kind == FieldKind::constant && p.fields[y].comps == 15;
     }
 
     void forward(Scene<R>& s) const override {
-        if (transposed) answer(s, s.value[y], s.value[x], R(1));
-        else see(s, s.value[x], s.value[y], R(1));
+        if (transposed) apply_transpose(s, s.value[y], s.value[x], R(1));
+        else apply(s, s.value[x], s.value[y], R(1));
     }
     void reverse(Scene<R>& s) const override {
-        if (transposed) see(s, s.bar[x], s.bar[y], R(-1));
-        else answer(s, s.bar[y], s.bar[x], R(-1));
+        if (transposed) apply(s, s.bar[x], s.bar[y], R(-1));
+        else apply_transpose(s, s.bar[y], s.bar[x], R(-1));
     }
     void tangent(Scene<R>& s) const override {
         forward(s);
-        at_once(s.directions, [&](auto n) {
-            using D = Along<R, n>;
+        with_direction_count(s.directions, [&](auto n) {
+            using D = DirectionPack<R, n>;
             D *in = reinterpret_cast<D*>(s.dot[x]), *out = reinterpret_cast<D*>(s.dot[y]);
-            if (transposed) answer_along(s, out, in);
-            else see_along(s, in, out);
+            if (transposed) apply_transpose_jvp(s, out, in);
+            else apply_jvp(s, in, out);
         });
     }
 
@@ -96,7 +96,7 @@ struct Derivatives : Stage<R> {
     Quad<R>& vector(R* field, int v) const { return *reinterpret_cast<Quad<R>*>(field + size_t(v) * 4); }
     const Row& row(const R* field, int v) const { return *reinterpret_cast<const Row*>(field + size_t(v) * 16); }
     Row& row(R* field, int v) const { return *reinterpret_cast<Row*>(field + size_t(v) * 16); }
-    static Row five_times(Quad<R> a) {  // in two steps: a widening shuffle would go through memory
+    static Row five_times(Quad<R> a) {  // in two steps, because a widening shuffle would go through memory
         const auto b = __builtin_shufflevector(a.v, a.v, 0, 1, 2, 3, 4, 5, 6, 7);
         if constexpr (HALVED<R, 16>)
             return {Wide<R>(__builtin_shufflevector(b, b, 0, 1, 2, 0, 1, 2, 0, 1)), Wide<R>(__builtin_shufflevector(b, b, 2, 0, 1, 2, 0, 1, 2, 3))};
@@ -130,22 +130,22 @@ struct Derivatives : Stage<R> {
         }
     }
 
-    // Y(v) += sign sum_u w(u) (X(u) - X(v)): differences, which are small wherever the sheet is.
-    void see(const Scene<R>& s, const R* from, R* to, R sign) const {
-        const Links<R>& l = *links->seeing;
+    // Y(v) += sign sum_u w(u) (X(u) - X(v)). Differences are small wherever the sheet lies, so they round little.
+    void apply(const Scene<R>& s, const R* from, R* to, R sign) const {
+        const CsrLinks<R>& l = *links->forward;
         over_rows(s, vertices(), [&](int begin, int end) {
             for (int v = begin; v < end; v++) {
-                const Quad<R> own = vector(from, v);
+                const Quad<R> centre = vector(from, v);
                 Row sum(0.0);
                 for (int k = l.first[v]; k < l.first[v + 1]; k++)
-                    sum = sum + weights(l.weight.data + 8 * size_t(k)) * five_times(vector(from, l.other[k]) - own);
+                    sum = sum + weights(l.weight.data + 8 * size_t(k)) * five_times(vector(from, l.other[k]) - centre);
                 row(to, v) = row(to, v) + double(sign) * sum;
             }
         });
     }
-    // X(v) -= sign times the transpose of that.
-    void answer(const Scene<R>& s, const R* from, R* to, R sign) const {
-        const Links<R>& l = *links->seen;
+    // X(v) -= sign times the transpose of this operator applied to Y.
+    void apply_transpose(const Scene<R>& s, const R* from, R* to, R sign) const {
+        const CsrLinks<R>& l = *links->transpose;
         over_rows(s, vertices(), [&](int begin, int end) {
             for (int v = begin; v < end; v++) {
                 Row sum(0.0);
@@ -156,11 +156,11 @@ struct Derivatives : Stage<R> {
         });
     }
     template <class D>
-    void see_along(const Scene<R>& s, const D* from, D* to) const {
-        const Links<R>& l = *links->seeing;
+    void apply_jvp(const Scene<R>& s, const D* from, D* to) const {
+        const CsrLinks<R>& l = *links->forward;
         over_rows(s, vertices(), [&](int begin, int end) {
             for (int v = begin; v < end; v++) {
-                D sum[15];  // in registers until the vertex is done
+                D sum[15];  // stays in registers until the vertex is done
                 for (D& part : sum) part = D(0.0);
                 for (int k = l.first[v]; k < l.first[v + 1]; k++) {
                     const R* w = l.weight.data + 8 * size_t(k);
@@ -175,16 +175,16 @@ struct Derivatives : Stage<R> {
         });
     }
     template <class D>
-    void answer_along(const Scene<R>& s, const D* from, D* to) const {
-        const Links<R>& l = *links->seen;
+    void apply_transpose_jvp(const Scene<R>& s, const D* from, D* to) const {
+        const CsrLinks<R>& l = *links->transpose;
         over_rows(s, vertices(), [&](int begin, int end) {
             for (int v = begin; v < end; v++) {
                 D sum[3] = {D(0.0), D(0.0), D(0.0)};
                 for (int k = l.first[v]; k < l.first[v + 1]; k++) {
                     const R* w = l.weight.data + 8 * size_t(k);
-                    const D* given = from + size_t(l.other[k]) * 16;
+                    const D* row_of_neighbour = from + size_t(l.other[k]) * 16;
                     for (int c = 0; c < 5; c++)
-                        for (int i = 0; i < 3; i++) sum[i] = sum[i] + given[3 * c + i] * w[c];
+                        for (int i = 0; i < 3; i++) sum[i] = sum[i] + row_of_neighbour[3 * c + i] * w[c];
                 }
                 D* target = to + size_t(v) * 4;
                 for (int i = 0; i < 3; i++) target[i] = target[i] + sum[i];

@@ -7,9 +7,9 @@ from torch.utils.checkpoint import checkpoint
 
 import torchcloth as tc
 from torchcloth.engine import cuda_graphs
-from torchcloth.engine.cuda_graphs import Graphs, unit_of
+from torchcloth.engine.cuda_graphs import GraphedRollout, segment_length
 from torchcloth.errors import InvalidInput
-from torchcloth.simulation.rollout import run
+from torchcloth.simulation.rollout import run_schedule
 
 FRAMES = [0.0, 0.02, 0.04, 0.08]
 
@@ -17,20 +17,20 @@ FRAMES = [0.0, 0.02, 0.04, 0.08]
 @pytest.fixture(autouse=True)
 def soon(monkeypatch):
     """Short simulations are captured, too."""
-    monkeypatch.setattr(cuda_graphs, "SOON", 0)
-    monkeypatch.setattr(cuda_graphs, "PAYS", 0)
+    monkeypatch.setattr(cuda_graphs, "WARMUP_SEGMENTS", 0)
+    monkeypatch.setattr(cuda_graphs, "MIN_REPLAYS", 0)
 
 
 def again(work: cuda_graphs.Work, device: torch.device | None = None) -> tuple[list[Tensor], cuda_graphs.Replay]:
     """Computes again what a graph would replay, in the same memory."""
-    found = work()
+    results = work()
 
     def replay() -> None:
-        for slot, now in zip(found, work(), strict=True):
+        for slot, now in zip(results, work(), strict=True):
             slot.copy_(now.detach())
 
-    found = [t.detach() for t in found]
-    return found, replay
+    results = [t.detach() for t in results]
+    return results, replay
 
 
 def refused(work: cuda_graphs.Work, device: torch.device) -> tuple[list[Tensor], cuda_graphs.Replay]:
@@ -62,9 +62,9 @@ def outcome(made, capture: cuda_graphs.Capture | None = None):
     """(the rollout, gradients of a function of it, the graphs)."""
     cloth, state, motion = made
     x = state.x.clone().requires_grad_()
-    plan = cloth.plan(state._replace(x=x), motion, FRAMES, None)
-    graphs = None if capture is None else Graphs(plan.model, sum(plan.counts), capture)
-    out = run(plan._replace(graphs=graphs), checkpoint=True)
+    plan = cloth.schedule(state._replace(x=x), motion, FRAMES, None)
+    graphs = None if capture is None else GraphedRollout(plan.model, sum(plan.counts), capture)
+    out = run_schedule(plan._replace(graphs=graphs), checkpoint=True)
     weight = torch.randn(out.x.shape, generator=torch.Generator().manual_seed(1), dtype=out.x.dtype)
     ((weight * out.x).sum() + out.wrench["hand"].square().sum()).backward()
     named = {"x": x, "pose": motion["hand"].pose, **dict(cloth.named_parameters())}
@@ -91,25 +91,25 @@ def test_replays_give_what_substeps_give_one_by_one(dtype, marks, contact):
         usual, other = (outcome(scene(contact), capture) for capture in (None, again))
     finally:
         torch.set_default_dtype(before)
-    assert other[2]._units
+    assert other[2]._segments
     agree(usual, other, marks)
 
 
 def test_without_gradients_nothing_is_kept():
     cloth, state, motion = scene()
     with torch.no_grad():
-        plan = cloth.plan(state, motion, FRAMES, None)
-        graphs = Graphs(plan.model, sum(plan.counts), again)
-        usual, other = run(plan, True), run(plan._replace(graphs=graphs), True)
+        plan = cloth.schedule(state, motion, FRAMES, None)
+        graphs = GraphedRollout(plan.model, sum(plan.counts), again)
+        usual, other = run_schedule(plan, True), run_schedule(plan._replace(graphs=graphs), True)
     torch.testing.assert_close(other.x, usual.x, rtol=1e-12, atol=1e-13)
-    assert all(unit.backward is None for unit in graphs._units.values())
-    assert graphs._units
+    assert all(unit.backward is None for unit in graphs._segments.values())
+    assert graphs._segments
 
 
 def test_grippers_that_open_are_another_unit():
     usual, other = (outcome(scene(opens=True), capture) for capture in (None, again))
     agree(usual, other, (1e-12, 1e-11))
-    assert {key[1] for key in other[2]._units} == {(("hand", True),), (("hand", False),)}
+    assert {key[1] for key in other[2]._segments} == {(("hand", True),), (("hand", False),)}
 
 
 def test_internal_variables_go_along():
@@ -125,33 +125,33 @@ def test_layers_that_meet_are_not_captured(monkeypatch):
     folded = state.x.clone()
     right = folded[:, 0] > 0.1
     folded[right, 0], folded[right, 2] = 0.2 - folded[right, 0], folded[right, 2] + 0.004
-    plan = cloth.plan(cloth.state(folded), motion, FRAMES[:2], None)
-    graphs = Graphs(plan.model, sum(plan.counts), again)
+    plan = cloth.schedule(cloth.state(folded), motion, FRAMES[:2], None)
+    graphs = GraphedRollout(plan.model, sum(plan.counts), again)
     with torch.no_grad():
-        run(plan._replace(graphs=graphs), True)
-    assert not graphs._units
+        run_schedule(plan._replace(graphs=graphs), True)
+    assert not graphs._segments
     usual = outcome(scene())
-    monkeypatch.setattr(cuda_graphs.Graphs, "reach", property(lambda self: 1e-9))
+    monkeypatch.setattr(cuda_graphs.GraphedRollout, "max_displacement_m", property(lambda self: 1e-9))
     other = outcome(scene(), again)
-    assert other[2]._units
+    assert other[2]._segments
     agree(usual, other, (1e-12, 1e-11))
 
 
 def test_few_units_do_not_pay(monkeypatch):
     with monkeypatch.context() as patch:
-        patch.setattr(cuda_graphs, "SOON", 100)
-        assert not outcome(scene(), again)[2]._units
-    monkeypatch.setattr(cuda_graphs, "PAYS", 100)
-    assert not outcome(scene(), again)[2]._units
+        patch.setattr(cuda_graphs, "WARMUP_SEGMENTS", 100)
+        assert not outcome(scene(), again)[2]._segments
+    monkeypatch.setattr(cuda_graphs, "MIN_REPLAYS", 100)
+    assert not outcome(scene(), again)[2]._segments
 
 
 def test_what_cannot_be_captured_is_launched_one_by_one():
     usual = outcome(scene())
     with pytest.warns(
         UserWarning, match="no CUDA graph of the substeps.*: operation not permitted when stream is"
-    ) as told:
+    ) as messages:
         other = outcome(scene(), refused)
-    assert len(told) == 1
+    assert len(messages) == 1
     agree(usual, other, (1e-12, 1e-11))
 
 
@@ -165,13 +165,13 @@ class Push(tc.effects.AbstractEffect):
     def coefficients(self):
         return None
 
-    def force(self, c, now):
-        return self.sizes[0] * now.mass * torch.ones_like(now.x)
+    def force(self, c, inputs):
+        return self.sizes[0] * inputs.mass * torch.ones_like(inputs.x)
 
 
 def test_gradients_of_what_is_no_parameter_are_not_lost():
     size = torch.tensor(2.0, requires_grad=True)
-    found = []
+    results = []
     for capture in (None, again):
         size.grad = None
         made = scene(effects={"push": Push(size)})
@@ -180,37 +180,37 @@ def test_gradients_of_what_is_no_parameter_are_not_lost():
         else:
             with pytest.warns(UserWarning, match="a part has a tensor .* with a gradient that is no parameter"):
                 outcome(made, capture)
-        found.append(float(size.grad))
-    assert found[0] != 0
-    assert found[1] == pytest.approx(found[0], rel=1e-9)
+        results.append(float(size.grad))
+    assert results[0] != 0
+    assert results[1] == pytest.approx(results[0], rel=1e-9)
 
 
 def test_gradients_of_gradients_are_refused():
     cloth, state, motion = scene()
     x = state.x.clone().requires_grad_()
-    plan = cloth.plan(state._replace(x=x), motion, FRAMES, None)
-    out = run(plan._replace(graphs=Graphs(plan.model, sum(plan.counts), again)), checkpoint=True)
+    plan = cloth.schedule(state._replace(x=x), motion, FRAMES, None)
+    out = run_schedule(plan._replace(graphs=GraphedRollout(plan.model, sum(plan.counts), again)), checkpoint=True)
     with pytest.raises(InvalidInput, match=r'create_graph=True; expected one; .*engine="reference"'):
         torch.autograd.grad(out.x.square().sum(), x, create_graph=True)
 
 
 def test_a_callers_checkpoint_is_not_captured():
     """It would compute the caller's work again in the midst of a capture."""
-    times, found = [], []
+    times, results = [], []
     for capture in (None, again):
         cloth, state, motion = scene()
 
         def work(x, cloth=cloth, state=state, motion=motion, capture=capture):
             times.append(capture)
-            plan = cloth.plan(state._replace(x=x), motion, FRAMES, None)
-            graphs = None if capture is None else Graphs(plan.model, sum(plan.counts), capture)
-            return run(plan._replace(graphs=graphs), checkpoint=True).x
+            plan = cloth.schedule(state._replace(x=x), motion, FRAMES, None)
+            graphs = None if capture is None else GraphedRollout(plan.model, sum(plan.counts), capture)
+            return run_schedule(plan._replace(graphs=graphs), checkpoint=True).x
 
         x = state.x.clone().requires_grad_()
         checkpoint(work, x, use_reentrant=False).square().sum().backward()
-        found.append(x.grad)
+        results.append(x.grad)
     assert times.count(None) == times.count(again) == 2
-    torch.testing.assert_close(found[1], found[0], rtol=1e-10, atol=1e-12)
+    torch.testing.assert_close(results[1], results[0], rtol=1e-10, atol=1e-12)
 
 
 def test_what_is_done_to_a_cloth_later_does_not_reach_its_graphs():
@@ -218,9 +218,9 @@ def test_what_is_done_to_a_cloth_later_does_not_reach_its_graphs():
     cloth, state, motion = scene()
     for p in cloth.parameters():
         p.requires_grad_(False)
-    plan = cloth.plan(state, motion, FRAMES, None)
-    own = Graphs(plan.model, 1, again).own
-    for name, part in own.boundaries.items():
+    plan = cloth.schedule(state, motion, FRAMES, None)
+    own_model = GraphedRollout(plan.model, 1, again).own_model
+    for name, part in own_model.boundaries.items():
         for key, buffer in part.named_buffers():
             theirs = cloth.boundaries[name].get_buffer(key)
             assert buffer is not theirs
@@ -231,20 +231,20 @@ def test_what_is_done_to_a_cloth_later_does_not_reach_its_graphs():
 def test_a_backward_pass_comes_long_after():
     """Of two simulations of which the second has run before the first is differentiated."""
     cloth, state, motion = scene()
-    found = []
+    results = []
     for capture in (None, again):
         cloth.zero_grad()
-        plan = cloth.plan(state, motion, FRAMES, None)
-        plan = plan._replace(graphs=None if capture is None else Graphs(plan.model, sum(plan.counts), capture))
-        first = run(plan, True)
+        plan = cloth.schedule(state, motion, FRAMES, None)
+        plan = plan._replace(graphs=None if capture is None else GraphedRollout(plan.model, sum(plan.counts), capture))
+        first = run_schedule(plan, True)
         faster = plan._replace(state=plan.state._replace(v=plan.state.v + 0.1))
-        second = run(faster, True)
+        second = run_schedule(faster, True)
         (first.x.square().sum() - second.x.sum()).backward()
-        found.append([p.grad.clone() for p in cloth.parameters() if p.grad is not None])
-    for a, b in zip(*found, strict=True):
+        results.append([p.grad.clone() for p in cloth.parameters() if p.grad is not None])
+    for a, b in zip(*results, strict=True):
         torch.testing.assert_close(b, a, rtol=1e-9, atol=1e-11 * float(a.abs().max()))
 
 
 @pytest.mark.parametrize(("count", "unit"), [(240, 24), (250, 10), (239, 17), (38, 19), (75, 15), (22, 22)])
 def test_units_leave_few_over(count, unit):
-    assert unit_of(count) == unit
+    assert segment_length(count) == unit
