@@ -1,4 +1,4 @@
-"""Speed, memory and start-up, beside the peers: ``torchcloth bench --help``."""
+"""Speed, memory and start-up time, compared with other simulators: ``torchcloth bench --help``."""
 
 if __name__ != "torchcloth.benchmarks":
     raise ImportError(f"got {__name__!r}; import this package as torchcloth.benchmarks")

@@ -1,4 +1,4 @@
-"""Who takes part, by name; each is built in a process of its own."""
+"""The contestants by name; each is built in a process of its own."""
 
 from __future__ import annotations
 
@@ -13,13 +13,21 @@ from .contestant import Contestant
 
 
 class Peer(NamedTuple):
-    """Another simulator."""
+    """Another simulator.
+
+    Attributes:
+        title: name for tables.
+        module: module of ``peers`` that wraps it.
+        factory: class of that module, which takes the number of threads.
+        package: package that must be importable.
+        distribution: its name for pip.
+    """
 
     title: str
-    module: str  # of ours, with
-    factory: str  # that takes the number of threads
-    package: str  # that must be importable
-    distribution: str  # as pip calls it
+    module: str
+    factory: str
+    package: str
+    distribution: str
 
 
 PEERS = {
@@ -30,24 +38,24 @@ PEERS = {
 }
 
 
-def build(name: str, threads: int) -> Contestant:
-    """Import and start a contestant in this process.
+def build_contestant(name: str, threads: int) -> Contestant:
+    """Return a contestant that runs in this process.
 
     Raises:
-        InvalidInput: neither an engine nor a peer.
+        InvalidInput: the name is neither that of an engine nor that of a peer.
     """
     if name in PEERS:
         peer = PEERS[name]
         return getattr(import_module(f".peers.{peer.module}", __package__), peer.factory)(threads)
     if name not in engines():
         raise InvalidInput("contestant", got=repr(name), expected=f"one of {', '.join([*engines(), *PEERS])}")
-    from .ours import Ours
+    from .ours import TorchclothContestant
 
-    return Ours(name, threads)
+    return TorchclothContestant(name, threads)
 
 
-def absent() -> dict[str, str]:
-    """Peers that are not installed, and how to install them."""
+def missing_peers() -> dict[str, str]:
+    """Return the peers that are not installed, each with the command that installs it."""
     return {
         name: f"pip install {peer.distribution}, or all: pip install 'torchcloth[bench]'"
         for name, peer in PEERS.items()
@@ -56,7 +64,7 @@ def absent() -> dict[str, str]:
 
 
 def _is_known(distribution: str) -> bool:
-    """A folder of a package's name is none."""
+    """A folder of the package's name is not the package."""
     try:
         return bool(metadata.version(distribution))
     except metadata.PackageNotFoundError:
@@ -64,11 +72,6 @@ def _is_known(distribution: str) -> bool:
 
 
 def versions() -> dict[str, str]:
-    """Of torch and the peers that are there."""
-    here = [peer.distribution for name, peer in PEERS.items() if name not in absent()]
-    return {name: metadata.version(name) for name in ("torchcloth", "torch", *here)}
-
-
-def best_engine() -> str:
-    """What a user gets by default."""
-    return engines()[0]
+    """Return the versions of torchcloth, torch and the installed peers."""
+    installed = [peer.distribution for name, peer in PEERS.items() if name not in missing_peers()]
+    return {name: metadata.version(name) for name in ("torchcloth", "torch", *installed)}

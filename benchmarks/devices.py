@@ -1,7 +1,7 @@
 """What a CUDA device gains, and from how many scenes on: ``python -m torchcloth.benchmarks.devices``.
 
 The same cloths and motion on the fused engine, on the processor and on the device, and there by the reference's
-substeps, captured as graphs and launched one by one. It ends where one does not agree with the first.
+substeps, uses_cuda_graphs as graphs and launched one by one. It ends where one does not agree with the first.
 """
 
 from __future__ import annotations
@@ -15,37 +15,48 @@ import torch
 
 import torchcloth as tc
 from torchcloth import cloth as layer
-from torchcloth.engine.dispatch import Choice, Setting
+from torchcloth.engine.dispatch import EngineChoice, Setting
 
-from .paths import LIKE, motion, seconds, sheet
+from .paths import MAX_RELATIVE_SLOPE_DIFFERENCE, motion, seconds, sheet
 
 
-class Way(NamedTuple):
-    """How a cloth is simulated."""
+class SimulationPath(NamedTuple):
+    """How a cloth is simulated.
+
+    Attributes:
+        device: of the tensors.
+        engine: setting of the cloth.
+        uses_cuda_graphs: the reference in CUDA graphs, even where the fused engine could run.
+    """
 
     device: str
     engine: Setting
-    captured: bool = False  # even where the engine could
+    uses_cuda_graphs: bool = False
 
 
-WAYS = {
-    "fused, CPU": Way("cpu", "fused"),
-    "fused, CUDA": Way("cuda", "fused"),
-    "reference, CUDA, graphs": Way("cuda", "auto", captured=True),
-    "reference, CUDA, one by one": Way("cuda", "reference"),
+PATHS = {
+    "fused, CPU": SimulationPath("cpu", "fused"),
+    "fused, CUDA": SimulationPath("cuda", "fused"),
+    "reference, CUDA, graphs": SimulationPath("cuda", "auto", uses_cuda_graphs=True),
+    "reference, CUDA, one by one": SimulationPath("cuda", "reference"),
 }
-AGREE = 1e-3  # m, in float32; rounding grows where cloth wrinkles
+MAX_POSITION_DIFFERENCE_M = 1e-3  # in float32; rounding errors grow where cloth wrinkles
 
 
 def main() -> None:
     """Print the table."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--scenes", type=int, nargs="+", default=[1, 32, 256], metavar="N", help="at a time")
-    parser.add_argument("--frames", type=int, help="at 30 Hz: 8, folded 1; cloth wrinkles, and later rounding shows")
+    parser.add_argument(
+        "--frames",
+        type=int,
+        help="at 30 Hz, by default 8, folded 1: in longer runs cloth wrinkles and rounding errors grow",
+    )
     parser.add_argument("--repeats", type=int, default=2)
-    parser.add_argument("--ways", nargs="+", choices=WAYS, default=list(WAYS), metavar="WAY", help=f"of {list(WAYS)}")
+    names = list(PATHS)
+    parser.add_argument("--paths", nargs="+", choices=PATHS, default=names, metavar="PATH", help=f"of {names}")
     contact = parser.add_mutually_exclusive_group()
-    contact.add_argument("--contact", action="store_true", help="with contact, though no layers meet")
+    contact.add_argument("--contact", action="store_true", help="with contact, although no layers meet")
     contact.add_argument("--folded", action="store_true", help="with contact, one half on the other")
     options = parser.parse_args()
     options.frames = (1 if options.folded else 8) if options.frames is None else options.frames
@@ -65,27 +76,35 @@ def main() -> None:
     )
     for scenes in options.scenes:
         first = None
-        for name in options.ways:
-            way = _measured(WAYS[name], scenes, times, options)
+        for name in options.paths:
+            way = _measure(PATHS[name], scenes, times, options)
             first = first or way
-            torch.testing.assert_close(way.end, first.end, rtol=0, atol=AGREE)
-            torch.testing.assert_close(way.slope, first.slope, rtol=LIKE, atol=0)
+            torch.testing.assert_close(way.end, first.end, rtol=0, atol=MAX_POSITION_DIFFERENCE_M)
+            torch.testing.assert_close(way.slope, first.slope, rtol=MAX_RELATIVE_SLOPE_DIFFERENCE, atol=0)
             each = 1e6 * way.forward / way.substeps / scenes
             cells = f"{way.substeps} | {way.forward:.3f} s | {way.gradient:.3f} s | {each:.2f} us"
             print(f"| {scenes} | {name} | {cells} |", flush=True)
 
 
-class Measured(NamedTuple):
-    """What one way gave, and what it took."""
+class PathResult(NamedTuple):
+    """Times and results of one path.
 
-    forward: float  # s
-    gradient: float  # s, with the forward run
+    Attributes:
+        forward: s.
+        gradient: s, with the forward run.
+        end: positions at the end.
+        slope: a gradient.
+        substeps: of the simulation.
+    """
+
+    forward: float
+    gradient: float
     end: torch.Tensor
     slope: torch.Tensor
     substeps: int
 
 
-def _measured(way: Way, scenes: int, times: list[float], options: argparse.Namespace) -> Measured:
+def _measure(way: SimulationPath, scenes: int, times: list[float], options: argparse.Namespace) -> PathResult:
     contact = tc.Contact() if options.contact or options.folded else None
     cloth = sheet(way.engine, python=False, contact=contact).to(way.device)
     state = folded(cloth) if options.folded else cloth.rest_state()
@@ -101,16 +120,16 @@ def _measured(way: Way, scenes: int, times: list[float], options: argparse.Names
         cloth(state, driven, times).x.square().mean().backward()
         return cloth.get_parameter("areal_density.raw").grad.cpu()  # type: ignore[union-attr]
 
-    with only_captured() if way.captured else torch.enable_grad():
+    with force_cuda_graphs() if way.uses_cuda_graphs else torch.enable_grad():
         value, end = seconds(forward, options.repeats)
         slope, along = seconds(gradient, options.repeats)
-        substeps = sum(cloth.plan(state, driven, times, None).counts)
-    return Measured(value, slope, end, along, substeps)
+        substeps = sum(cloth.schedule(state, driven, times, None).counts)
+    return PathResult(value, slope, end, along, substeps)
 
 
 def folded(cloth: tc.Cloth) -> tc.ClothState:
-    """The right half over the left one, nearer than layers rest."""
-    x, grid = cloth.rest_state().x.clone(), cloth.grid()
+    """Return a state with the right half over the left one, nearer than layers rest."""
+    x, grid = cloth.rest_state().x.clone(), cloth.contact_grid()
     if grid is None:
         raise ValueError("no contact, no layers")
     middle = x[:, 0].mean()
@@ -121,14 +140,14 @@ def folded(cloth: tc.Cloth) -> tc.ClothState:
 
 
 @contextmanager
-def only_captured() -> Iterator[None]:
-    """On a device, without the engine."""
-    usual = layer.choose
-    layer.choose = lambda *_: Choice(None, "for comparison", captured=True)
+def force_cuda_graphs() -> Iterator[None]:
+    """Make the reference run in CUDA graphs instead of the fused engine, within the context."""
+    original = layer.choose_engine
+    layer.choose_engine = lambda *_: EngineChoice(None, "for comparison", uses_cuda_graphs=True)
     try:
         yield
     finally:
-        layer.choose = usual
+        layer.choose_engine = original
 
 
 if __name__ == "__main__":

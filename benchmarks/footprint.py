@@ -14,29 +14,29 @@ import numpy as np
 from . import guards
 from .contestant import Task
 from .measure import Timing
-from .suite import Plan, Record, record
-from .worker import Failed, Worker
+from .suite import BenchPlan, Record, record
+from .worker import ContestantFailed, Worker
 
-LONG = 20_000  # substeps of a long manipulation: 3.2 s
-WARM_UP = 10  # substeps
+LONG_ROLLOUT_SUBSTEPS = 20_000  # a long manipulation: 3.2 s
+WARM_UP_SUBSTEPS = 10
 
-START = """
+START_UP_SCRIPT = """
 import time
 start = time.perf_counter()
 import torchcloth
 imported = time.perf_counter() - start
 from torchcloth.benchmarks.contestant import Task
-from torchcloth.benchmarks.contestants import build
-run = build({engine!r}, {threads}).prepare(Task({case!r}, {quantity!r}, {substeps}, small={small}))
+from torchcloth.benchmarks.contestants import build_contestant
+run = build_contestant({engine!r}, {threads}).prepare(Task({case!r}, {quantity!r}, {substeps}, small={small}))
 outcome = run()
 import json
 print(json.dumps({{"seconds": time.perf_counter() - start, "import_seconds": imported, "x": outcome.x.tolist()}}))
 """
 
 
-def memory(plan: Plan) -> dict[str, Record]:
-    """Peaks by key: a gradient over a long manipulation, and tangents over one and ten times the steps."""
-    long, short = (LONG if plan.engines[0] != "reference" else 500), 250
+def memory(plan: BenchPlan) -> dict[str, Record]:
+    """Return memory peaks by key: a gradient over a long manipulation, tangents over 1 and 10 times the substeps."""
+    long, short = (LONG_ROLLOUT_SUBSTEPS if plan.engines[0] != "reference" else 500), 250
     if plan.fast:
         long, short = 20, 4
     tasks = {
@@ -48,45 +48,45 @@ def memory(plan: Plan) -> dict[str, Record]:
 
 
 def peak(task: Task, name: str, threads: int) -> Record:
-    """Time, and memory [MiB] above that of the same contestant when it has run the scene briefly.
+    """Return time and memory [MiB] above that of the same contestant after a brief run of the scene.
 
     Raises:
-        Failed: the contestant's process ended, or the physics is wrong.
+        ContestantFailed: the contestant's process ended, or its result fails the checks.
     """
     with Worker(name, threads) as worker:
-        worker.prepare(replace(task, substeps=WARM_UP))
+        worker.prepare(replace(task, substeps=WARM_UP_SUBSTEPS))
         worker.forget()
         base = worker.build(task)
         seconds = worker.sample(task, 0.0)
         outcome, highest = worker.result(task)
-    case = task.scene()
-    wrong = guards.problems(case, task.substeps, outcome.x)
+    case = task.build_case()
+    wrong = guards.physics_violations(case, task.substeps, outcome.x)
     if wrong:
-        raise Failed("; ".join(wrong))
-    found = record(task, case.triangles, Timing.of([seconds]))
-    return found | {"peak_mebibytes": round(highest - base, 1), "base_mebibytes": round(base, 1)}
+        raise ContestantFailed("; ".join(wrong))
+    timing = record(task, case.triangles, Timing.of([seconds]))
+    return timing | {"peak_mebibytes": round(highest - base, 1), "base_mebibytes": round(base, 1)}
 
 
-def start_up(plan: Plan, repeats: int = 3) -> dict[str, Record]:
-    """Seconds from ``import torchcloth`` to a first result, by key; the best of ``repeats`` fresh interpreters."""
-    found = {}
+def start_up(plan: BenchPlan, repeats: int = 3) -> dict[str, Record]:
+    """Return seconds from ``import torchcloth`` to a first result by key, the best of ``repeats`` new interpreters."""
+    records = {}
     for engine in plan.engines[:1] if plan.fast else plan.engines:
         for quantity in ("forward", "gradient"):
             runs = [_start(engine, quantity, plan) for _ in range(1 if plan.fast else repeats)]
-            found[f"startup.{quantity}.{engine}"] = min(runs, key=lambda run: run["seconds"])
-    return found
+            records[f"startup.{quantity}.{engine}"] = min(runs, key=lambda run: run["seconds"])
+    return records
 
 
-def _start(engine: str, quantity: Any, plan: Plan) -> Record:
+def _start(engine: str, quantity: Any, plan: BenchPlan) -> Record:
     task = Task("standard", quantity, 10 if plan.fast else 50, small=plan.fast)
     values = {"case": task.case, "quantity": quantity, "substeps": task.substeps, "small": task.small}
-    code = START.format(engine=engine, threads=plan.threads, **values)
+    code = START_UP_SCRIPT.format(engine=engine, threads=plan.threads, **values)
     environment = {**os.environ, "OMP_NUM_THREADS": str(plan.threads)}
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=environment)
-    if done.returncode:
-        raise Failed(f"start-up of {engine}: {(done.stderr.strip().splitlines() or ['no message'])[-1]}")
-    answer = json.loads(done.stdout.splitlines()[-1])
-    wrong = guards.problems(task.scene(), task.substeps, np.array(answer.pop("x")))
+    process = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=environment)
+    if process.returncode:
+        raise ContestantFailed(f"start-up of {engine}: {(process.stderr.strip().splitlines() or ['no message'])[-1]}")
+    answer = json.loads(process.stdout.splitlines()[-1])
+    wrong = guards.physics_violations(task.build_case(), task.substeps, np.array(answer.pop("x")))
     if wrong:
-        raise Failed(f"start-up of {engine}: {'; '.join(wrong)}")
-    return answer | {"substeps": task.substeps, "triangles": task.scene().triangles}
+        raise ContestantFailed(f"start-up of {engine}: {'; '.join(wrong)}")
+    return answer | {"substeps": task.substeps, "triangles": task.build_case().triangles}

@@ -1,4 +1,4 @@
-"""What this machine can do at most, and how far a substep is from it."""
+"""Limits of this machine, and how far a substep is from them."""
 
 from __future__ import annotations
 
@@ -13,53 +13,64 @@ from typing import Any, NamedTuple
 
 import torch
 
-from torchcloth.engine.building import Unbuilt, compiler
+from torchcloth.engine.building import EngineUnavailable, compiler
 
 from .cases import Case
 
-COPIED = 128 * 2**20  # bytes: beyond any cache
-FMA = r"""
+COPY_BYTES = 128 * 2**20  # larger than any cache
+FMA_SOURCE = r"""
 #include <thread>
 #include <vector>
 static volatile float sink;
-static void work(long rounds) {
+static void work(long measurement_rounds) {
     constexpr int WIDTH = 16, CHAINS = 12;  // floats of the widest SIMD register; enough chains to hide the latency
     float a[CHAINS][WIDTH];
     for (auto& row : a) for (int i = 0; i < WIDTH; ++i) row[i] = 1.0f + 1e-3f * i;
     const float x = 0.999999f, y = 1e-6f;
-    for (long r = 0; r < rounds; ++r)
+    for (long r = 0; r < measurement_rounds; ++r)
         for (int c = 0; c < CHAINS; ++c)
             for (int i = 0; i < WIDTH; ++i) a[c][i] = a[c][i] * x + y;
     float sum = 0;
     for (auto& row : a) for (int i = 0; i < WIDTH; ++i) sum += row[i];
     sink = sum;
 }
-extern "C" double flops(long rounds) { return 2.0 * 16 * 12 * rounds; }
-extern "C" void run(long rounds, int threads) {
+extern "C" double flops(long measurement_rounds) { return 2.0 * 16 * 12 * measurement_rounds; }
+extern "C" void run(long measurement_rounds, int threads) {
     std::vector<std::thread> others;
-    for (int t = 1; t < threads; ++t) others.emplace_back(work, rounds);
-    work(rounds);
+    for (int t = 1; t < threads; ++t) others.emplace_back(work, measurement_rounds);
+    work(measurement_rounds);
     for (auto& t : others) t.join();
 }
 """
 
 
-class Counts(NamedTuple):
-    """Of one substep."""
+class OperationCounts(NamedTuple):
+    """Operations of one substep.
 
-    flops: float  # additions and multiplications; a square root or division counts as one
-    bytes: float  # that must be read or written at least once, float32
+    Attributes:
+        flops: additions and multiplications; a square root or division counts as one.
+        bytes: memory that must be read or written at least once, in float32.
+    """
+
+    flops: float
+    bytes: float
 
 
 class Limits(NamedTuple):
-    """Of this machine, with the threads asked for."""
+    """Limits of this machine with a number of threads.
 
-    bytes_per_second: float  # copied: read and written
+    Attributes:
+        bytes_per_second: of a copy, read and written.
+        flops_per_second: multiply-adds, each counted as two.
+        flops_by: how the latter was measured.
+    """
+
+    bytes_per_second: float
     flops_per_second: float
-    flops_by: str  # how that was measured
+    flops_by: str
 
-    def distance(self, counts: Counts, seconds: float) -> dict[str, float]:
-        """A substep's time against the least that arithmetic or memory would allow."""
+    def distance(self, counts: OperationCounts, seconds: float) -> dict[str, float]:
+        """Return a substep's time and the shortest times that arithmetic and memory allow."""
         arithmetic, memory = counts.flops / self.flops_per_second, counts.bytes / self.bytes_per_second
         return {
             "flops": counts.flops,
@@ -71,40 +82,41 @@ class Limits(NamedTuple):
         }
 
 
-# By hand from physics of the substep, multiplications and additions each counted as one.
-_MEMBRANE = 240.0  # per triangle: edges, F, normal, J, cofactors, stress, corner forces
-_DIRECTOR = 175.0  # per triangle: stress, reaction, affine gradient from the mesh, return map
-_SPLINES = 45.0  # per particle: weights and slopes along the axes
+# Counted by hand from the equations of a substep; multiplications and additions count as one each.
+MEMBRANE_FLOPS_PER_TRIANGLE = 240.0  # per triangle: edges, F, normal, J, cofactors, stress, corner forces
+DIRECTOR_FLOPS_PER_TRIANGLE = 175.0  # per triangle: stress, reaction, affine gradient from the mesh, return map
+SPLINE_FLOPS_PER_POINT = 45.0  # per particle: weights and slopes along the axes
 # per point and node: weight 2, slope 6, mass 2, push 11, its gathering 10, moment 18, momentum 12, gradient 21
-_PER_NODE = 82.0
-_VERTEX = 30.0  # per vertex: weight, velocity, position, grippers
+NODE_FLOPS_PER_POINT_AND_NODE = 82.0
+FLOPS_PER_VERTEX = 30.0  # per vertex: weight, velocity, position, grippers
 
 
-def counts(case: Case, active: int) -> Counts:
-    """Of a substep of a case with effects no more than weight, ``active`` triangles using the grid, a point each.
+def count_operations(case: Case, active: int) -> OperationCounts:
+    """Return the operations of a substep with gravity alone and ``active`` triangles on the grid, one point each.
 
     Bytes: state read and written once, the mesh's constants read once, the touched nodes of the grid written and read
     once for mass and push and again for momentum.
     """
     vertices, triangles = len(case.mesh.vertices), case.triangles
-    flops = _VERTEX * vertices + _MEMBRANE * triangles + (_DIRECTOR + _SPLINES + 27 * _PER_NODE) * active
+    flops = FLOPS_PER_VERTEX * vertices + MEMBRANE_FLOPS_PER_TRIANGLE * triangles
+    flops += (DIRECTOR_FLOPS_PER_TRIANGLE + SPLINE_FLOPS_PER_POINT + 27 * NODE_FLOPS_PER_POINT_AND_NODE) * active
     nodes = 3.0 * active  # a sheet with one point per half cell, in a layer three nodes thick: about two to four
     numbers = vertices * (2 * 6 + 1) + triangles * (3 + 4 + 1) + active * (2 * 3 + 1) + nodes * 2 * (4 + 3)
-    return Counts(flops, 4.0 * numbers)
+    return OperationCounts(flops, 4.0 * numbers)
 
 
 def measure(threads: int) -> Limits:
-    """Copy bandwidth and multiply-add rate."""
+    """Measure the copy bandwidth and the multiply-add rate."""
     flops = _by_compiler(threads)
-    rate, how = (flops, "FMA loop in C++") if flops else (_by_matmul(), "float32 matmul of torch")
+    rate, how = (flops, "FMA_SOURCE loop in C++") if flops else (_by_matmul(), "float32 matmul of torch")
     return Limits(_bandwidth(), rate, how)
 
 
 def _bandwidth() -> float:
-    source = torch.ones(COPIED // 4)
+    source = torch.ones(COPY_BYTES // 4)
     target = torch.empty_like(source)
     target.copy_(source)
-    return 2 * COPIED / min(_seconds(lambda: target.copy_(source)) for _ in range(5))
+    return 2 * COPY_BYTES / min(_seconds(lambda: target.copy_(source)) for _ in range(5))
 
 
 def _by_matmul() -> float:
@@ -114,14 +126,14 @@ def _by_matmul() -> float:
 
 
 def _by_compiler(threads: int) -> float | None:
-    """None without a compiler that works."""
+    """Multiply-adds per second of a compiled loop; None without a compiler that works."""
     try:
         command = compiler()
-    except Unbuilt:
+    except EngineUnavailable:
         return None
     with tempfile.TemporaryDirectory() as folder:
         source, library = Path(folder) / "fma.cpp", Path(folder) / "fma.so"
-        source.write_text(FMA)
+        source.write_text(FMA_SOURCE)
         flags = ["-O3", "-march=native", "-ffast-math", "-mprefer-vector-width=512", "-shared", "-fPIC", "-pthread"]
         for chosen in (flags, [f for f in flags if not f.startswith("-mprefer")]):
             built = subprocess.run([*command, *chosen, str(source), "-o", str(library)], capture_output=True)
@@ -131,10 +143,10 @@ def _by_compiler(threads: int) -> float | None:
             return None
         loop = ctypes.CDLL(str(library))
         loop.flops.restype = ctypes.c_double
-        rounds = 500_000
-        arguments = (ctypes.c_long(rounds), ctypes.c_int(threads))
+        measurement_rounds = 500_000
+        arguments = (ctypes.c_long(measurement_rounds), ctypes.c_int(threads))
         seconds = min(_seconds(lambda: loop.run(*arguments)) for _ in range(3))
-        return threads * float(loop.flops(ctypes.c_long(rounds))) / seconds
+        return threads * float(loop.flops(ctypes.c_long(measurement_rounds))) / seconds
 
 
 def _seconds(call) -> float:
@@ -144,7 +156,7 @@ def _seconds(call) -> float:
 
 
 def machine(threads: int) -> dict[str, Any]:
-    """What figures depend on."""
+    """Return what timings depend on: processor, threads, load and software."""
     return {
         "processor": _processor(),
         "cores": os.cpu_count(),

@@ -11,25 +11,31 @@ from statistics import median
 from typing import NamedTuple, TypeVar
 
 Result = TypeVar("Result")
-SHORTEST = 0.2  # s, of one sample: shorter runs are repeated within it
-MEBI = 2**20
+MIN_SAMPLE_S = 0.2  # shorter runs are repeated within a sample
+BYTES_PER_MEBIBYTE = 2**20
 
 
 class Timing(NamedTuple):
-    """Of one run, over all samples."""
+    """Time of one run, over all samples.
 
-    median: float  # s
-    minimum: float  # s
+    Attributes:
+        median: s.
+        minimum: s.
+        samples: count.
+    """
+
+    median: float
+    minimum: float
     samples: int
 
     @classmethod
     def of(cls, samples: list[float]) -> Timing:
-        """From seconds per run."""
+        """Summarise samples of seconds per run."""
         return cls(median(samples), min(samples), len(samples))
 
 
-def sample(run: Callable[[], Result], shortest: float = SHORTEST) -> tuple[float, Result]:
-    """Seconds per run, repeated until ``shortest`` seconds have passed, and what the last one returned."""
+def sample(run: Callable[[], Result], shortest: float = MIN_SAMPLE_S) -> tuple[float, Result]:
+    """Return the seconds per run, repeated for at least ``shortest`` seconds, and the last result."""
     start, count = time.perf_counter(), 0
     while True:
         result, count = run(), count + 1
@@ -38,18 +44,18 @@ def sample(run: Callable[[], Result], shortest: float = SHORTEST) -> tuple[float
             return elapsed / count, result
 
 
-def resident() -> float:
-    """Memory of this process now [MiB]; where the system does not say, its peak."""
-    return _status("VmRSS")
+def resident_mebibytes() -> float:
+    """Return the present memory of this process [MiB]; where the system does not report it, the peak."""
+    return _proc_status("VmRSS")
 
 
 def peak() -> float:
-    """Largest memory that this process ever had [MiB]."""
-    return _status("VmHWM")
+    """Return the largest memory that this process had so far [MiB]."""
+    return _proc_status("VmHWM")
 
 
-def _status(field: str) -> float:
-    """``ru_maxrss`` would count the parent's peak at the fork as well: only for systems without /proc."""
+def _proc_status(field: str) -> float:
+    """A field of /proc [MiB]; without /proc ``ru_maxrss``, which counts the parent's peak at the fork as well."""
     try:
         for line in Path("/proc/self/status").read_text().splitlines():
             if line.startswith(field + ":"):
@@ -57,4 +63,4 @@ def _status(field: str) -> float:
     except OSError:
         pass
     unit = 1 if sys.platform == "darwin" else 1024
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit / MEBI
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit / BYTES_PER_MEBIBYTE

@@ -1,4 +1,4 @@
-"""torchcloth itself, with one of its engines."""
+"""torchcloth as a contestant, with one of its engines."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ from torch import Tensor
 
 import torchcloth as tc
 
-from .cases import DT, Scene, stage
-from .contestant import DIRECTIONS, Contestant, Outcome, Task
+from .cases import SUBSTEP_S, Scene, build_scene
+from .contestant import TANGENT_DIRECTIONS, Contestant, Outcome, Task
 
-LIMIT = DT * (1 + 1e-6)  # frame times are rounded
+MAX_SUBSTEP_S = SUBSTEP_S * (1 + 1e-6)  # because frame times are rounded
 
 
-class Ours(Contestant):
-    """A cloth layer in float32."""
+class TorchclothContestant(Contestant):
+    """A cloth in float32."""
 
     def __init__(self, engine: str, threads: int) -> None:
         self.engine = engine
@@ -25,8 +25,8 @@ class Ours(Contestant):
         torch.set_num_threads(self.threads)
 
     def prepare(self, task: Task) -> Callable[[], Outcome]:
-        """Build the layer; the frames are those of a user who asks for 25 a second."""
-        scene = stage(task.scene(), self.engine, task.substeps, task.batch)
+        """Build the cloth; there are 25 frames a second, as a user may ask for."""
+        scene = build_scene(task.build_case(), self.engine, task.substeps, task.batch)
         return {"forward": _forward, "gradient": _gradient, "tangents8": _tangents}[task.quantity](scene)
 
 
@@ -46,11 +46,11 @@ def _gradient(scene: Scene) -> Callable[[], Outcome]:
         youngs = cast("tc.PhysicalParameter", scene.cloth.material.youngs_modulus)
         end = _end(scene, x, motion)
         loss = (end**2).mean()
-        by_x, by_raw, *by_pose = torch.autograd.grad(loss, [x, youngs.raw, *poses.values()])
-        by_youngs = float(by_raw / youngs.value.detach())  # raw is the logarithm
+        gradient_x, by_raw, *by_pose = torch.autograd.grad(loss, [x, youngs.raw, *poses.values()])
+        gradient_youngs = float(by_raw / youngs.value.detach())  # raw is the logarithm
         extra = tuple(g.numpy() for g in by_pose)
         return _outcome(end.detach())._replace(
-            loss=float(loss.detach()), by_x=_first(by_x), by_youngs=by_youngs, extra=extra
+            loss=float(loss.detach()), gradient_x=_first(gradient_x), gradient_youngs=gradient_youngs, extra=extra
         )
 
     return run
@@ -58,7 +58,7 @@ def _gradient(scene: Scene) -> Callable[[], Outcome]:
 
 def _tangents(scene: Scene) -> Callable[[], Outcome]:
     raws = {name: raw for name, raw in scene.cloth.named_parameters() if _counts(scene.cloth, name, raw)}
-    mixing = torch.randn(DIRECTIONS, len(raws), generator=torch.Generator().manual_seed(0), dtype=scene.x.dtype)
+    mixing = torch.randn(TANGENT_DIRECTIONS, len(raws), generator=torch.Generator().manual_seed(0), dtype=scene.x.dtype)
 
     def run() -> Outcome:
         x, tangent = tangents(scene, raws, mixing)
@@ -71,7 +71,7 @@ def tangents(scene: Scene, raws: Mapping[str, Tensor], directions: Tensor) -> tu
     """End [V, 3] m, and the frames' derivatives [K, T, V, 3] along ``directions`` [K, unconstrained parameters]."""
     along = tc.Directions({name: column.contiguous() for name, column in zip(raws, directions.T, strict=True)})
     state = scene.cloth.state(scene.x)
-    rollout, moved = scene.cloth.sensitivities(state, scene.motion, scene.times, along=along, dt=LIMIT)
+    rollout, moved = scene.cloth.sensitivities(state, scene.motion, scene.times, along=along, dt=MAX_SUBSTEP_S)
     return rollout.x[-1].clone(), moved.x
 
 
@@ -82,7 +82,7 @@ def _counts(cloth: tc.Cloth, name: str, raw: Tensor) -> bool:
 
 
 def _end(scene: Scene, x: Tensor, motion: dict[str, tc.Trajectory]) -> Tensor:
-    return scene.cloth(scene.cloth.state(x), motion, scene.times, dt=LIMIT).x.select(-3, -1)
+    return scene.cloth(scene.cloth.state(x), motion, scene.times, dt=MAX_SUBSTEP_S).x.select(-3, -1)
 
 
 def _outcome(end: Tensor) -> Outcome:

@@ -1,4 +1,4 @@
-"""What each path through the engine costs: ``python -m torchcloth.benchmarks.paths``.
+"""Times of each path through the engine: ``python -m torchcloth.benchmarks.paths``.
 
 The same cloth and motion on the fused engine, on the fused engine with one effect in Python, and on the torch
 reference. All three must agree, or nothing is printed.
@@ -18,18 +18,23 @@ from torchcloth.effects import AbstractEffect, Amplitude
 from torchcloth.engine.dispatch import Setting
 from torchcloth.simulation.sensitivities import Directions
 
-LIKE = 1e-2  # relative, of slopes in float32
+MAX_RELATIVE_SLOPE_DIFFERENCE = 1e-2  # of derivatives in float32
 T = TypeVar("T")
 PATHS: dict[str, tuple[Setting, bool]] = {
     "fused": ("fused", False),
     "fused, one effect in Python": ("fused", True),
     "reference": ("reference", False),
 }
-FABRIC = ("material.youngs_modulus.raw", "material.poisson_ratio.raw", "areal_density.raw", "effects.air.normal.raw")
+FABRIC_PARAMETERS = (
+    "material.youngs_modulus.raw",
+    "material.poisson_ratio.raw",
+    "areal_density.raw",
+    "effects.air.normal.raw",
+)
 
 
 class Pull(AbstractEffect):
-    """A user's force: a breath on every vertex, so weak that all paths lead to the same place."""
+    """A user's force on every vertex, so weak that all paths give the same positions."""
 
     amplitudes = {"strength": Amplitude("N", 1e-12, 1e-13)}
 
@@ -38,16 +43,16 @@ class Pull(AbstractEffect):
         self.strength = tc.PhysicalParameter(1e-12, "N", "nonnegative", name="pull")
 
     def coefficients(self):
-        """Its strength."""
+        """Return its strength."""
         return self.strength.field
 
     def force(self, c, now):
-        """Away from the origin."""
+        """Return a force away from the origin."""
         return c * now.x
 
 
 def sheet(engine: Setting, python: bool, contact: tc.Contact | None = None, cells: int = 20) -> tc.Cloth:
-    """0.5 m, of so many cells a side: 441 vertices, 800 triangles."""
+    """Return a sheet of 0.5 m with so many cells a side: by default 441 vertices and 800 triangles."""
     effects = {"gravity": tc.effects.Gravity(), "air": tc.effects.AirDrag(1.2), "bending": tc.effects.Bending(1e-5)}
     if python:
         effects["pull"] = Pull()
@@ -57,14 +62,14 @@ def sheet(engine: Setting, python: bool, contact: tc.Contact | None = None, cell
 
 
 def motion(end: float) -> dict[str, tc.Trajectory]:
-    """A hand that rises."""
+    """Return the motion of a hand that rises."""
     pose = torch.eye(4).repeat(9, 1, 1)
     pose[:, 2, 3] = torch.linspace(0.0, 0.2, 9) ** 2
     return {"hand": tc.Trajectory(torch.linspace(0.0, end, 9), pose, torch.ones(9, dtype=torch.bool))}
 
 
 def seconds(work: Callable[[], T], repeats: int) -> tuple[float, T]:
-    """(the best of some runs, the result)."""
+    """Return the time of the fastest of some runs [s], and the result."""
     taken = []
     while True:
         begin = time.perf_counter()
@@ -88,7 +93,9 @@ def main() -> None:
     for name, (engine, python) in PATHS.items():
         cloth = sheet(engine, python)
         state, driven = cloth.rest_state(), motion(times[-1])
-        along = Directions({n: row.clone() for n, row in zip(FABRIC, torch.eye(len(FABRIC)), strict=True)})
+        along = Directions(
+            {n: row.clone() for n, row in zip(FABRIC_PARAMETERS, torch.eye(len(FABRIC_PARAMETERS)), strict=True)}
+        )
 
         def forward(cloth=cloth, state=state, driven=driven):
             with torch.no_grad():
@@ -97,7 +104,7 @@ def main() -> None:
         def gradient(cloth=cloth, state=state, driven=driven):
             cloth.zero_grad()
             cloth(state, driven, times).x.pow(2).sum().backward()
-            return torch.stack([cloth.get_parameter(name).grad for name in FABRIC])  # type: ignore[arg-type]
+            return torch.stack([cloth.get_parameter(name).grad for name in FABRIC_PARAMETERS])  # type: ignore[arg-type]
 
         def tangents(cloth=cloth, state=state, driven=driven, along=along):
             return cloth.sensitivities(state, driven, times, along=along)
@@ -107,13 +114,23 @@ def main() -> None:
         moves, (_, moved) = seconds(tangents, options.repeats)
         ends.append((out.x, slopes, moved.x))
         rows.append((name, best, slope, moves))
-        substeps = sum(cloth.plan(state, driven, times, None).counts)
+        substeps = sum(cloth.schedule(state, driven, times, None).counts)
     for x, slopes, moved in ends[1:]:
         torch.testing.assert_close(x, ends[0][0], rtol=0, atol=1e-4)
-        torch.testing.assert_close(slopes, ends[0][1], rtol=LIKE, atol=LIKE * float(ends[0][1].abs().max()))
-        torch.testing.assert_close(moved, ends[0][2], rtol=LIKE, atol=LIKE * float(ends[0][2].abs().max()))
+        torch.testing.assert_close(
+            slopes,
+            ends[0][1],
+            rtol=MAX_RELATIVE_SLOPE_DIFFERENCE,
+            atol=MAX_RELATIVE_SLOPE_DIFFERENCE * float(ends[0][1].abs().max()),
+        )
+        torch.testing.assert_close(
+            moved,
+            ends[0][2],
+            rtol=MAX_RELATIVE_SLOPE_DIFFERENCE,
+            atol=MAX_RELATIVE_SLOPE_DIFFERENCE * float(ends[0][2].abs().max()),
+        )
     print(f"{substeps} substeps of 800 triangles, {torch.get_num_threads()} thread(s), {torch.get_default_dtype()}\n")
-    print(f"| path | forward | gradient | {len(FABRIC)} tangents | per substep |\n|---|---|---|---|---|")
+    print(f"| path | forward | gradient | {len(FABRIC_PARAMETERS)} tangents | per substep |\n|---|---|---|---|---|")
     for name, value, slope, moves in rows:
         print(f"| {name} | {value:.3f} s | {slope:.3f} s | {moves:.3f} s | {1e6 * value / substeps:.0f} us |")
 

@@ -1,4 +1,4 @@
-"""Ratios between records."""
+"""Ratios between timings."""
 
 from __future__ import annotations
 
@@ -34,53 +34,53 @@ CONVENTIONS = {
 
 
 def ratios(records: Mapping[str, Record], engine: str) -> dict[str, float]:
-    """All ratios that the records allow; ``engine`` is torchcloth's best."""
-    found = {}
-    for name, (above, below) in pairs(engine).items():
+    """Return all ratios that the records allow; ``engine`` is torchcloth's fastest."""
+    result = {}
+    for name, (above, below) in ratio_keys(engine).items():
         if above in records and below in records:
-            found[name] = records[above]["seconds"] / records[below]["seconds"]
+            result[name] = records[above]["seconds"] / records[below]["seconds"]
     growth = _growth(records, engine)
-    return {name: float(f"{value:.4g}") for name, value in (found | growth).items()}
+    return {name: float(f"{value:.4g}") for name, value in (result | growth).items()}
 
 
-def pairs(engine: str) -> dict[str, tuple[str, str]]:
-    """Name -> (key above, key below)."""
+def ratio_keys(engine: str) -> dict[str, tuple[str, str]]:
+    """Return (key of the numerator, key of the denominator) by the name of the ratio."""
     equal, default, lone = "standard-everywhere", "standard", "sheet-800"
-    short, found = ("forward_250", "forward"), {}  # the name of a ratio, and what is measured
+    short, result = ("forward_250", "forward"), {}  # the name of a ratio, and what is measured
     for name, quantity, label in (("forward", "forward", ".1s"), ("gradient", "gradient", ""), (*short, "")):
         for peer in ("taichi", "warp"):
             above = f"{quantity}.{equal}{label}.{peer}"
-            found[f"{name}_vs_{peer}"] = (above, f"{quantity}.{default}{label}.{engine}")
-            found[f"{name}_everywhere_vs_{peer}"] = (above, f"{quantity}.{equal}{label}.{engine}")
+            result[f"{name}_vs_{peer}"] = (above, f"{quantity}.{default}{label}.{engine}")
+            result[f"{name}_everywhere_vs_{peer}"] = (above, f"{quantity}.{equal}{label}.{engine}")
     for quantity in ("forward", "gradient"):
         for peer in ("newton", "mujoco"):
-            found[f"{quantity}_vs_{peer}"] = (f"{quantity}.{lone}.{peer}", f"{quantity}.{lone}.{engine}")
-    found["forward_contact_vs_newton"] = (f"forward.{default}.newton", f"forward.{default}.{engine}")
-    found["forward_vs_eager"] = (f"forward.{default}.1s.reference", f"forward.{default}.1s.{engine}")
-    found["gradient_vs_forward_1s"] = (f"gradient.{default}.1s.{engine}", f"forward.{default}.1s.{engine}")
+            result[f"{quantity}_vs_{peer}"] = (f"{quantity}.{lone}.{peer}", f"{quantity}.{lone}.{engine}")
+    result["forward_contact_vs_newton"] = (f"forward.{default}.newton", f"forward.{default}.{engine}")
+    result["forward_vs_eager"] = (f"forward.{default}.1s.reference", f"forward.{default}.1s.{engine}")
+    result["gradient_vs_forward_1s"] = (f"gradient.{default}.1s.{engine}", f"forward.{default}.1s.{engine}")
     for name, quantity in (short, ("gradient", "gradient"), ("tangents8", "tangents8")):
         for case, suffix in ((equal, "_everywhere"), (default, ""), ("garment", "_garment")):
-            found[f"{name}{suffix}_vs_eager"] = (f"{quantity}.{case}.reference", f"{quantity}.{case}.{engine}")
+            result[f"{name}{suffix}_vs_eager"] = (f"{quantity}.{case}.reference", f"{quantity}.{case}.{engine}")
     for case, suffix in ((equal, "_everywhere"), (default, ""), ("standard-usual", "_usual"), ("garment", "_garment")):
         for quantity in ("tangents8", "gradient"):
-            found[f"{quantity}_vs_forward{suffix}"] = (f"{quantity}.{case}.{engine}", f"forward.{case}.{engine}")
+            result[f"{quantity}_vs_forward{suffix}"] = (f"{quantity}.{case}.{engine}", f"forward.{case}.{engine}")
     one = f"forward.{default}.batch-1.{engine}"
     for size in (8, 32):
-        found[f"batch{size}_vs_batch1"] = (f"forward.{default}.batch-{size}.{engine}", one)
-    return found
+        result[f"batch{size}_vs_batch1"] = (f"forward.{default}.batch-{size}.{engine}", one)
+    return result
 
 
 def _growth(records: Mapping[str, Record], engine: str) -> dict[str, float]:
-    """How far cost is from proportional to triangles and to substeps, and tangents' memory from constant."""
-    found = {}
+    """Cost per triangle and per substep at large sizes over that at small ones; 1 if it is proportional."""
+    result = {}
     sizes = [r for key, r in records.items() if key.startswith("forward.sheet-") and key.endswith(f".size.{engine}")]
     if len(sizes) > 1:
         middle = min(sizes, key=lambda r: abs(r["triangles"] - 800))
         largest = max(sizes, key=lambda r: r["triangles"])
         each = [r["seconds"] / r["triangles"] for r in (largest, middle)]
-        found["linear_in_triangles"] = each[0] / each[1]
+        result["linear_in_triangles"] = each[0] / each[1]
     lengths = [r for key, r in records.items() if ".steps-" in key and key.endswith(engine)]
     steps = sorted((r["substeps"], r["seconds"]) for r in lengths)
     if len(steps) > 1:
-        found["linear_in_substeps"] = steps[-1][1] / steps[-1][0] / (steps[0][1] / steps[0][0])
-    return found
+        result["linear_in_substeps"] = steps[-1][1] / steps[-1][0] / (steps[0][1] / steps[0][0])
+    return result

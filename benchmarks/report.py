@@ -1,17 +1,17 @@
-"""The measurements for a person: a table, and a plot of cost against size."""
+"""The measurements as tables, and as a plot of cost against size."""
 
 from __future__ import annotations
 
 from pathlib import Path
 from typing import Any
 
-from torchcloth._utils.files import atomically
+from torchcloth._utils.files import write_atomically
 
 COLUMNS = ("", "triangles", "substeps", "batch", "seconds", "ms/substep")
 
 
 def show(result: dict[str, Any]) -> None:
-    """Tables on the terminal."""
+    """Print tables on the terminal."""
     from rich import box
     from rich.console import Console
     from rich.table import Table
@@ -47,12 +47,12 @@ def show(result: dict[str, Any]) -> None:
         console.print(f"{name}: {text}", style="dim", markup=False)
     for key, note in result["notes"].items():
         console.print(f"{key}: {note}", style="yellow", markup=False)
-    for name, remedy in result["absent"].items():
+    for name, remedy in result["missing_peers"].items():
         console.print(f"{name}: not installed ({remedy})", style="yellow", markup=False)
 
 
 def plot(result: dict[str, Any], folder: Path) -> Path | None:
-    """Cost against triangles and against substeps as ``folder``/bench.png; None without such records."""
+    """Plot cost against triangles and against substeps as ``folder``/bench.png; None without such records."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
     from matplotlib.ticker import NullFormatter
@@ -75,6 +75,6 @@ def plot(result: dict[str, Any], folder: Path) -> Path | None:
         axes.xaxis.set_minor_formatter(NullFormatter())
         axes.legend(frameon=False)
     path = folder / "bench.png"
-    with atomically(path) as part:
+    with write_atomically(path) as part:
         figure.savefig(part, dpi=150)
     return path

@@ -1,8 +1,8 @@
-"""A contestant in a process of its own: compiled code, thread pools and memory do not meet.
+"""A contestant in a process of its own, so that compiled code, thread pools and memory are separate.
 
-One JSON object a line each way: {"prepare": task, "run": flag}, {"sample": task, "shortest": seconds},
-{"result": task} and {"forget": {}} are answered in turn. Who is not asked is stopped: thread pools watch for work long
-after their last, at others' expense.
+Each line in either direction is one JSON object: {"prepare": task, "run": flag}, {"sample": task, "shortest": seconds},
+{"result": task} and {"forget": {}} are answered in turn. A process that is not asked is stopped, because thread pools
+poll for work long after their last piece, at the expense of others.
 """
 
 from __future__ import annotations
@@ -25,12 +25,12 @@ from . import measure
 from .contestant import Outcome, Task, Unsupported
 
 
-class Failed(Exception):
-    """A contestant could not do what it was asked."""
+class ContestantFailed(Exception):
+    """A contestant failed or ended; the text says why."""
 
 
 class Worker:
-    """The near end; use as a context."""
+    """The benchmark's end of a contestant's process; use it as a context."""
 
     def __init__(self, name: str, threads: int) -> None:
         self.name = name
@@ -56,25 +56,25 @@ class Worker:
         self.close()
 
     def prepare(self, task: Task) -> float:
-        """Build, compile and run once; seconds of that."""
+        """Build, compile and run a task once; return the seconds it took."""
         return self._ask({"prepare": asdict(task), "run": True})["seconds"]
 
     def build(self, task: Task) -> float:
-        """Without the run; memory of the process after it [MiB]."""
+        """Build and compile a task; return the memory of the process after it [MiB]."""
         return self._ask({"prepare": asdict(task), "run": False})["mebibytes"]
 
-    def sample(self, task: Task, shortest: float = measure.SHORTEST) -> float:
-        """Seconds per run of a task that was prepared."""
+    def sample(self, task: Task, shortest: float = measure.MIN_SAMPLE_S) -> float:
+        """Return the seconds per run of a prepared task."""
         return self._ask({"sample": asdict(task), "shortest": shortest})["seconds"]
 
     def result(self, task: Task) -> tuple[Outcome, float]:
-        """What its last run computed, and this process's peak memory [MiB]."""
+        """Return the outcome of the last run, and the peak memory of the process [MiB]."""
         answer = self._ask({"result": asdict(task)})
         fields = {name: _array(value) for name, value in answer["outcome"].items()}
         return Outcome(**fields), answer["mebibytes"]
 
     def forget(self) -> None:
-        """All tasks that were prepared, and their memory."""
+        """Drop all prepared tasks and their memory."""
         self._ask({"forget": {}})
 
     def close(self) -> None:
@@ -95,7 +95,7 @@ class Worker:
             self._process.stdin.write(json.dumps(request) + "\n")  # type: ignore[union-attr]
             self._process.stdin.flush()  # type: ignore[union-attr]
         except OSError:
-            pass  # it died: the answer says why
+            pass  # the process ended; the answer says why
         try:
             return self._answer()
         finally:
@@ -110,23 +110,23 @@ class Worker:
         if not line:
             self._errors.seek(0)
             last = self._errors.read().decode(errors="replace").strip().splitlines()[-1:]
-            raise Failed(f"{self.name} ended: {' '.join(last) or 'no message'}")
+            raise ContestantFailed(f"{self.name} ended: {' '.join(last) or 'no message'}")
         answer = json.loads(line)
         if "unsupported" in answer:
             raise Unsupported(answer["unsupported"])
         if "error" in answer:
-            raise Failed(f"{self.name}: {answer['error']}")
+            raise ContestantFailed(f"{self.name}: {answer['error']}")
         return answer
 
 
 def _serve(name: str, threads: int) -> None:
-    """The far end."""
+    """The contestant's end: answer requests until stdin closes."""
     answers = os.fdopen(os.dup(1), "w", buffering=1)
     os.dup2(2, 1)  # what simulators print must not mix with the answers
-    from .contestants import build
+    from .contestants import build_contestant
 
-    contestant = build(name, threads)
-    _say(answers, {"threads": contestant.threads})
+    contestant = build_contestant(name, threads)
+    _write_answer(answers, {"threads": contestant.threads})
     runs: dict[Task, Callable[[], Outcome]] = {}
     outcomes: dict[Task, Outcome] = {}
     for line in sys.stdin:
@@ -137,31 +137,33 @@ def _serve(name: str, threads: int) -> None:
                 runs[task] = contestant.prepare(task)
                 if request["run"]:
                     outcomes[task] = runs[task]()
-                _say(answers, {"seconds": time.perf_counter() - start, "mebibytes": measure.resident()})
+                _write_answer(
+                    answers, {"seconds": time.perf_counter() - start, "mebibytes": measure.resident_mebibytes()}
+                )
             elif "sample" in request:
                 task = Task(**request["sample"])
                 seconds, outcomes[task] = measure.sample(runs[task], request["shortest"])
-                _say(answers, {"seconds": seconds})
+                _write_answer(answers, {"seconds": seconds})
             elif "result" in request:
                 outcome = outcomes[Task(**request["result"])]
                 fields = {key: _plain(value) for key, value in outcome._asdict().items()}
-                _say(answers, {"outcome": fields, "mebibytes": measure.peak()})
+                _write_answer(answers, {"outcome": fields, "mebibytes": measure.peak()})
             else:
                 runs.clear()
                 outcomes.clear()
-                _say(answers, {})
+                _write_answer(answers, {})
         except Unsupported as error:
-            _say(answers, {"unsupported": str(error)})
+            _write_answer(answers, {"unsupported": str(error)})
         except Exception as error:
-            _say(answers, {"error": f"{type(error).__name__}: {' '.join(str(error).split())[:300]}"})
+            _write_answer(answers, {"error": f"{type(error).__name__}: {' '.join(str(error).split())[:300]}"})
 
 
-def _say(answers: IO[str], answer: dict[str, Any]) -> None:
+def _write_answer(answers: IO[str], answer: dict[str, Any]) -> None:
     answers.write(json.dumps(answer) + "\n")
 
 
 def _plain(value: Any) -> Any:
-    """For JSON; of the other derivatives only what the checks need."""
+    """A value for JSON; of the other derivatives only what the checks need."""
     if isinstance(value, tuple):
         return [[float(np.abs(part).max()) if np.isfinite(part).all() else float("nan")] for part in value]
     return value.tolist() if isinstance(value, np.ndarray) else value

@@ -6,11 +6,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..cases import DENSITY, DT, MATERIAL, SPACING, Case
+from ..cases import AREAL_DENSITY_KG_PER_M2, CELL_SIZE_M, MATERIAL, SUBSTEP_S, Case
 
-NODES = 44  # of the dense grid, along each axis
-THICKNESS = 1e-3  # m
-GRAVITY = -9.81  # m/s^2, along z
+GRID_NODES_PER_AXIS = 44  # of the dense grid, along each axis
+THICKNESS_M = 1e-3  # m
+GRAVITY_Z_M_PER_S2 = -9.81  # m/s^2, along z
 VERTEX_SHARE, TRIANGLE_SHARE = 0.75, 0.25  # of the mass of vertices; of a triangle's, that it carries itself
 
 
@@ -24,7 +24,7 @@ class Arrays(NamedTuple):
     area: np.ndarray  # [E] float32 m^2
     vertex_mass: np.ndarray  # [V] float32 kg, the whole lumped mass
     element_mass: np.ndarray  # [E] float32 kg, the quarter that is the element's own
-    held: np.ndarray  # [V] int32, 1: moved by the grippers
+    gripped: np.ndarray  # [V] int32, 1: moved by the grippers
     velocity: np.ndarray  # [substeps, 3] float32 m/s, of the grippers during each substep
 
 
@@ -44,24 +44,24 @@ def arrays(case: Case, substeps: int) -> Arrays:
     gradient = mesh.shape_gradient
     frame = np.stack([gradient[:, 1, 0], gradient[:, 2, 0], gradient[:, 1, 1], gradient[:, 2, 1]], axis=1)
     middle = (mesh.vertices.min(0) + mesh.vertices.max(0)) / 2
-    shift = SPACING * np.round(NODES / 2 - middle / SPACING)
-    held = np.zeros(len(mesh.vertices), np.int32)
-    held[case.fixed] = 1
+    shift = CELL_SIZE_M * np.round(GRID_NODES_PER_AXIS / 2 - middle / CELL_SIZE_M)
+    gripped = np.zeros(len(mesh.vertices), np.int32)
+    gripped[case.gripped_vertices] = 1
     return Arrays(
         x=(mesh.vertices + shift).astype(np.float32),
         shift=shift.astype(np.float32),
         faces=mesh.faces.astype(np.int32),
         frame=frame.astype(np.float32),
         area=mesh.area.astype(np.float32),
-        vertex_mass=(DENSITY * mesh.vertex_area).astype(np.float32),
-        element_mass=(TRIANGLE_SHARE * DENSITY * mesh.area).astype(np.float32),
-        held=held,
-        velocity=(case.displacements(substeps) / DT).astype(np.float32),
+        vertex_mass=(AREAL_DENSITY_KG_PER_M2 * mesh.vertex_area).astype(np.float32),
+        element_mass=(TRIANGLE_SHARE * AREAL_DENSITY_KG_PER_M2 * mesh.area).astype(np.float32),
+        gripped=gripped,
+        velocity=(case.displacements(substeps) / SUBSTEP_S).astype(np.float32),
     )
 
 
 def law() -> Law:
     """Plane stress, as torchcloth's default."""
-    nu, h = MATERIAL["poisson_ratio"], THICKNESS
+    nu, h = MATERIAL["poisson_ratio"], THICKNESS_M
     director = (MATERIAL["contact_stiffness"] * h, MATERIAL["shear_stiffness"] * h, MATERIAL["cone"])
     return Law(h / (2 * (1 + nu)), h * nu / (1 - nu * nu), *director)

@@ -3,9 +3,9 @@
 import mujoco
 import numpy as np
 
-from ..cases import DENSITY, DT, MATERIAL
+from ..cases import AREAL_DENSITY_KG_PER_M2, MATERIAL, SUBSTEP_S
 from ..contestant import Contestant, Outcome, Task, Unsupported
-from .arrays import GRAVITY, THICKNESS
+from .arrays import GRAVITY_Z_M_PER_S2, THICKNESS_M
 
 XML = """<mujoco>
   <option timestep="{dt}" integrator="Euler" gravity="0 0 {gravity}">
@@ -31,30 +31,30 @@ class MuJoCo(Contestant):
         """A model of the scene."""
         if task.quantity != "forward" or task.batch:
             raise Unsupported("MuJoCo has no derivatives through a flex but finite differences, and no batches of it")
-        case = task.scene()
+        case = task.build_case()
         mesh, shift = case.mesh, case.displacements(task.substeps)
         xml = XML.format(
-            dt=DT,
-            gravity=GRAVITY,
+            dt=SUBSTEP_S,
+            gravity=GRAVITY_Z_M_PER_S2,
             points=" ".join(f"{value:.9g}" for value in mesh.vertices.ravel()),
             faces=" ".join(map(str, mesh.faces.ravel())),
             youngs=MATERIAL["youngs_modulus"],
             poisson=MATERIAL["poisson_ratio"],
-            thickness=THICKNESS,
+            thickness=THICKNESS_M,
         )
         model = mujoco.MjModel.from_xml_string(xml)
-        model.body_mass[1:] = DENSITY * mesh.vertex_area  # flexcomp gives all points the same mass
+        model.body_mass[1:] = AREAL_DENSITY_KG_PER_M2 * mesh.vertex_area  # flexcomp gives all points the same mass
         data = mujoco.MjData(model)
         mujoco.mj_setConst(model, data)
         # views of MuJoCo's memory: slide joints, so that qpos is each vertex's displacement
         q, v = data.qpos.reshape(-1, 3), data.qvel.reshape(-1, 3)
-        held, places = case.fixed, np.cumsum(shift, axis=0)
+        gripped, places = case.gripped_vertices, np.cumsum(shift, axis=0)
 
         def run() -> Outcome:
             mujoco.mj_resetData(model, data)
             for k in range(task.substeps):
                 mujoco.mj_step(model, data)
-                q[held], v[held] = places[k], shift[k] / DT
+                q[gripped], v[gripped] = places[k], shift[k] / SUBSTEP_S
             return Outcome(mesh.vertices + q)
 
         return run

@@ -4,11 +4,11 @@ import newton
 import numpy as np
 import warp as wp
 
-from ..cases import DENSITY, DT, MATERIAL
+from ..cases import AREAL_DENSITY_KG_PER_M2, MATERIAL, SUBSTEP_S
 from ..contestant import Contestant, Outcome, Task, Unsupported
-from .arrays import GRAVITY, Arrays, arrays, law
+from .arrays import GRAVITY_Z_M_PER_S2, Arrays, arrays, law
 
-RADIUS = 0.01  # m, of the particles' contact: below half an edge, so that neighbours do not push
+CONTACT_RADIUS_M = 0.01  # m, of the particles' contact: below half an edge, so that neighbours do not push
 
 
 class Newton(Contestant):
@@ -22,7 +22,7 @@ class Newton(Contestant):
         """Forward and gradient of one scene."""
         if task.quantity == "tangents8" or task.batch:
             raise Unsupported("Newton has no forward mode; batches of cloth are more of one scene")
-        case, gradient = task.scene(), task.quantity == "gradient"
+        case, gradient = task.build_case(), task.quantity == "gradient"
         sheet = Sheet(arrays(case, task.substeps), task.substeps, gradient, case.contact is not None and not gradient)
         return sheet.gradient if gradient else sheet.forward
 
@@ -51,13 +51,13 @@ class Sheet:
         self.states = [self.model.state() for _ in range(substeps + 1 if grad else 2)]
         self.control = self.model.control()
         self.start = self.states[0].particle_q.numpy().copy()
-        self.index = wp.array(np.flatnonzero(data.held).astype(np.int32), dtype=int, device="cpu")
+        self.index = wp.array(np.flatnonzero(data.gripped).astype(np.int32), dtype=int, device="cpu")
         self.velocity = wp.array(data.velocity, dtype=wp.vec3, device="cpu")
         self.loss = wp.zeros(1, dtype=float, device="cpu", requires_grad=grad)
 
     def _build(self, grad: bool):
         data, youngs = self.data, MATERIAL["youngs_modulus"]
-        builder = newton.ModelBuilder(up_axis=newton.Axis.Z, gravity=(0.0, 0.0, GRAVITY))
+        builder = newton.ModelBuilder(up_axis=newton.Axis.Z, gravity=(0.0, 0.0, GRAVITY_Z_M_PER_S2))
         builder.add_cloth_mesh(
             pos=wp.vec3(0.0, 0.0, 0.0),
             rot=wp.quat_identity(),
@@ -65,15 +65,15 @@ class Sheet:
             vel=wp.vec3(0.0, 0.0, 0.0),
             vertices=[wp.vec3(*map(float, p)) for p in data.x],
             indices=data.faces.ravel().tolist(),
-            density=DENSITY,
+            density=AREAL_DENSITY_KG_PER_M2,
             tri_ke=self.law.mu * youngs,
             tri_ka=(self.law.lam + self.law.mu) * youngs,  # with tri_ke the same linear elasticity as ours
             tri_kd=0.0,
             edge_ke=0.0,
             edge_kd=0.0,
-            particle_radius=RADIUS,
+            particle_radius=CONTACT_RADIUS_M,
         )
-        for i in np.flatnonzero(data.held):
+        for i in np.flatnonzero(data.gripped):
             builder.particle_mass[i] = 0.0
         return builder.finalize(device="cpu", requires_grad=grad)
 
@@ -86,7 +86,7 @@ class Sheet:
             before, after = self.states[k % count], self.states[(k + 1) % count]
             before.clear_forces()
             wp.launch(lead, len(self.index), [self.index, self.velocity, k, before.particle_qd], device="cpu")
-            self.solver.step(before, after, self.control, None, DT)
+            self.solver.step(before, after, self.control, None, SUBSTEP_S)
 
     def forward(self) -> Outcome:
         """Positions at the end."""
@@ -102,12 +102,12 @@ class Sheet:
             x, share = self.states[self.substeps].particle_q, 1.0 / (3.0 * len(self.start))
             wp.launch(squares, len(self.start), [x, wp.vec3(*self.data.shift.tolist()), share, self.loss], device="cpu")
         tape.backward(loss=self.loss)
-        by_x = self.states[0].particle_q.grad.numpy().copy()
+        gradient_x = self.states[0].particle_q.grad.numpy().copy()
         by_law = self.model.tri_materials.grad.numpy().sum(0)
-        by_youngs = float(by_law[0] * self.law.mu + by_law[1] * (self.law.lam + self.law.mu))
-        found = Outcome(self.end(), float(self.loss.numpy()[0]), by_x, by_youngs)
+        gradient_youngs = float(by_law[0] * self.law.mu + by_law[1] * (self.law.lam + self.law.mu))
+        result = Outcome(self.end(), float(self.loss.numpy()[0]), gradient_x, gradient_youngs)
         tape.zero()
-        return found
+        return result
 
     def end(self) -> np.ndarray:
         """[V, 3] m."""

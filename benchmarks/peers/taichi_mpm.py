@@ -1,17 +1,17 @@
 """A-EP by the usual material point method in Taichi: APIC, dense grid, quadratic B-splines (torchcloth's "apic").
 
-The reverse pass goes as in DiffTaichi: the state of every substep is kept, the grid is made again.
+The reverse pass goes as in DiffTaichi: the state of every substep is stored, the grid is made again.
 """
 
 import numpy as np
 import taichi as ti
 
-from ..cases import DT, MATERIAL, SPACING
+from ..cases import CELL_SIZE_M, MATERIAL, SUBSTEP_S
 from ..contestant import Contestant, Outcome, Task, Unsupported
-from .arrays import GRAVITY, NODES, VERTEX_SHARE, Arrays, arrays, law
+from .arrays import GRAVITY_Z_M_PER_S2, GRID_NODES_PER_AXIS, VERTEX_SHARE, Arrays, arrays, law
 
 LAW = law()
-INVERSE = 1.0 / SPACING
+INVERSE = 1.0 / CELL_SIZE_M
 
 
 class Taichi(Contestant):
@@ -25,7 +25,7 @@ class Taichi(Contestant):
         """Forward and gradient of one scene."""
         if task.quantity == "tangents8" or task.batch:
             raise Unsupported("our Taichi version has neither forward mode nor batches")
-        data = arrays(task.scene(), task.substeps)
+        data = arrays(task.build_case(), task.substeps)
         sheet = Sheet(data, task.substeps, task.quantity == "gradient")
         sheet.warm_up()
         return sheet.gradient if task.quantity == "gradient" else sheet.forward
@@ -39,33 +39,43 @@ def gradient_of(w: ti.template(), d: ti.template(), i: ti.template(), j: ti.temp
 
 @ti.data_oriented
 class Sheet:
-    """Fields and kernels; with ``grad`` every substep's state is kept."""
+    """Fields and kernels; with ``grad`` every substep's state is stored."""
 
     def __init__(self, data: Arrays, substeps: int, grad: bool) -> None:
         self.data, self.substeps, self.grad = data, substeps, grad
         self.V, self.E = len(data.x), len(data.faces)
-        V, E, kept = self.V, self.E, substeps + 1 if grad else 2
+        V, E, stored = self.V, self.E, substeps + 1 if grad else 2
 
         def vectors(*shape: int):
             return ti.Vector.field(3, ti.f32, shape=shape, needs_grad=grad)
 
-        self.x, self.v, self.d3, self.moved = vectors(kept, V), vectors(kept, V), vectors(kept, E), vectors(kept, E)
-        self.C = ti.Matrix.field(3, 3, ti.f32, shape=(kept, V + E), needs_grad=grad)
+        self.x, self.v, self.d3, self.moved = (
+            vectors(stored, V),
+            vectors(stored, V),
+            vectors(stored, E),
+            vectors(stored, E),
+        )
+        self.C = ti.Matrix.field(3, 3, ti.f32, shape=(stored, V + E), needs_grad=grad)
         self.force, self.pull = vectors(V), vectors(E)
         self.momentum = ti.Vector.field(3, ti.f32, needs_grad=grad)
         self.mass = ti.field(ti.f32, needs_grad=grad)
-        ti.root.dense(ti.ijk, NODES).place(self.momentum, self.mass)
+        ti.root.dense(ti.ijk, GRID_NODES_PER_AXIS).place(self.momentum, self.mass)
         if grad:
-            ti.root.dense(ti.ijk, NODES).place(self.momentum.grad, self.mass.grad)
+            ti.root.dense(ti.ijk, GRID_NODES_PER_AXIS).place(self.momentum.grad, self.mass.grad)
         self.youngs = ti.field(ti.f32, shape=(), needs_grad=grad)
         self.loss = ti.field(ti.f32, shape=(), needs_grad=grad)
         self.faces = ti.Vector.field(3, ti.i32, shape=E)
         self.frame = ti.Vector.field(4, ti.f32, shape=E)
         self.area, self.m_element = ti.field(ti.f32, shape=E), ti.field(ti.f32, shape=E)
-        self.m_vertex, self.held = ti.field(ti.f32, shape=V), ti.field(ti.i32, shape=V)
+        self.m_vertex, self.gripped = ti.field(ti.f32, shape=V), ti.field(ti.i32, shape=V)
         self.driven = ti.Vector.field(3, ti.f32, shape=substeps)
-        pairs = ((self.faces, data.faces), (self.frame, data.frame), (self.area, data.area), (self.held, data.held))
-        for field, values in (*pairs, (self.m_element, data.element_mass), (self.driven, data.velocity)):
+        fields = (
+            (self.faces, data.faces),
+            (self.frame, data.frame),
+            (self.area, data.area),
+            (self.gripped, data.gripped),
+        )
+        for field, values in (*fields, (self.m_element, data.element_mass), (self.driven, data.velocity)):
             field.from_numpy(values)
         self.m_vertex.from_numpy(VERTEX_SHARE * data.vertex_mass)
         self.start, self.origin = vectors(V), ti.Vector(data.shift.tolist())
@@ -112,7 +122,7 @@ class Sheet:
 
     @ti.kernel
     def forces(self, s: ti.i32):
-        """Membrane and director, on vertices; what the director does through the grid, kept for the transfer."""
+        """Membrane and director, on vertices; what the director does through the grid, stored for the transfer."""
         for e in range(self.E):
             t = self.faces[e]
             g = self.frame[e]
@@ -150,11 +160,13 @@ class Sheet:
             w = [0.5 * (1.5 - offset) ** 2, 0.75 - (offset - 1.0) ** 2, 0.5 * (offset - 0.5) ** 2]
             m = self.m_vertex[i]
             C = m * self.C[s, i]
-            given = m * (self.v[s, i] + DT * ti.Vector([0.0, 0.0, GRAVITY])) + DT * self.force[i]
+            given = (
+                m * (self.v[s, i] + SUBSTEP_S * ti.Vector([0.0, 0.0, GRAVITY_Z_M_PER_S2])) + SUBSTEP_S * self.force[i]
+            )
             for a, b, c in ti.static(ti.ndrange(3, 3, 3)):
                 node = ti.Vector([a, b, c])
                 weight = w[a][0] * w[b][1] * w[c][2]
-                self.momentum[base + node] += weight * (given + C @ ((ti.cast(node, ti.f32) - offset) * SPACING))
+                self.momentum[base + node] += weight * (given + C @ ((ti.cast(node, ti.f32) - offset) * CELL_SIZE_M))
                 self.mass[base + node] += weight * m
         for e in range(self.E):
             t = self.faces[e]
@@ -166,13 +178,13 @@ class Sheet:
             d = [(offset - 1.5) * INVERSE, (2.0 - 2.0 * offset) * INVERSE, (offset - 0.5) * INVERSE]
             m = self.m_element[e]
             C = m * self.C[s, self.V + e]
-            given = m * (mean + DT * ti.Vector([0.0, 0.0, GRAVITY]))
-            d3, pull = self.d3[s, e], DT * self.pull[e]
+            given = m * (mean + SUBSTEP_S * ti.Vector([0.0, 0.0, GRAVITY_Z_M_PER_S2]))
+            d3, pull = self.d3[s, e], SUBSTEP_S * self.pull[e]
             for a, b, c in ti.static(ti.ndrange(3, 3, 3)):
                 node = ti.Vector([a, b, c])
                 weight = w[a][0] * w[b][1] * w[c][2]
                 push = gradient_of(w, d, a, b, c).dot(d3)
-                carried = given + C @ ((ti.cast(node, ti.f32) - offset) * SPACING)
+                carried = given + C @ ((ti.cast(node, ti.f32) - offset) * CELL_SIZE_M)
                 self.momentum[base + node] += weight * carried - push * pull
                 self.mass[base + node] += weight * m
 
@@ -190,11 +202,11 @@ class Sheet:
                 given = w[a][0] * w[b][1] * w[c][2] / self.heavy(base + node) * self.momentum[base + node]
                 v += given
                 C += given.outer_product(ti.cast(node, ti.f32) - offset)
-            if self.held[i] == 1:
+            if self.gripped[i] == 1:
                 v = self.driven[k]
             self.C[after, i] = 4.0 * INVERSE * C
             self.v[after, i] = v
-            self.x[after, i] = self.x[s, i] + DT * v
+            self.x[after, i] = self.x[s, i] + SUBSTEP_S * v
         for e in range(self.E):
             t = self.faces[e]
             place = (self.x[s, t[0]] + self.x[s, t[1]] + self.x[s, t[2]]) * (INVERSE / 3.0)
@@ -210,7 +222,7 @@ class Sheet:
                 C += (w[a][0] * w[b][1] * w[c][2] * given).outer_product(ti.cast(node, ti.f32) - offset)
                 change += gradient_of(w, d, a, b, c).dot(self.d3[s, e]) * given
             self.C[after, self.V + e] = 4.0 * INVERSE * C
-            self.moved[after, e] = self.d3[s, e] + DT * change
+            self.moved[after, e] = self.d3[s, e] + SUBSTEP_S * change
 
     @ti.kernel
     def map_back(self, after: ti.i32):

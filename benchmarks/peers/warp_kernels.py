@@ -2,13 +2,13 @@
 
 import warp as wp
 
-from ..cases import DT, SPACING
-from .arrays import GRAVITY, law
+from ..cases import CELL_SIZE_M, SUBSTEP_S
+from .arrays import GRAVITY_Z_M_PER_S2, law
 
 LAW = law()
 MU, LAM, CONTACT, SHEAR, CONE = (wp.constant(wp.float32(value)) for value in LAW)
-STEP, WIDTH, INVERSE = (wp.constant(wp.float32(value)) for value in (DT, SPACING, 1.0 / SPACING))
-FALL = wp.constant(wp.vec3(0.0, 0.0, GRAVITY * DT))
+STEP, WIDTH, INVERSE = (wp.constant(wp.float32(value)) for value in (SUBSTEP_S, CELL_SIZE_M, 1.0 / CELL_SIZE_M))
+FALL = wp.constant(wp.vec3(0.0, 0.0, GRAVITY_Z_M_PER_S2 * SUBSTEP_S))
 
 
 @wp.func
@@ -48,7 +48,7 @@ def forces(
     force: wp.array(dtype=wp.vec3),
     pull: wp.array(dtype=wp.vec3),
 ):
-    """Membrane and director, on vertices; what the director does through the grid, kept for the transfer."""
+    """Membrane and director, on vertices; what the director does through the grid, stored for the transfer."""
     e = wp.tid()
     t = faces[e]
     g = frame[e]
@@ -151,7 +151,7 @@ def elements_to_grid(
 def grid_to_vertices(
     x: wp.array(dtype=wp.vec3),
     grid: wp.array3d(dtype=wp.vec4),
-    held: wp.array(dtype=int),
+    gripped: wp.array(dtype=int),
     driven: wp.array(dtype=wp.vec3),
     k: int,
     x_after: wp.array(dtype=wp.vec3),
@@ -174,7 +174,7 @@ def grid_to_vertices(
                 given = wx[a] * wy[b] * wz[c] * given
                 v += given
                 C += wp.outer(given, wp.vec3(float(a), float(b), float(c)) - offset)
-    if held[p] == 1:
+    if gripped[p] == 1:
         v = driven[k]
     C_after[p] = 4.0 * INVERSE * C
     v_after[p] = v

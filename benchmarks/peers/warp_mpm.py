@@ -10,7 +10,7 @@ import warp as wp
 from ..cases import MATERIAL
 from ..contestant import Contestant, Outcome, Task, Unsupported
 from . import warp_kernels as kernels
-from .arrays import NODES, VERTEX_SHARE, Arrays, arrays
+from .arrays import GRID_NODES_PER_AXIS, VERTEX_SHARE, Arrays, arrays
 
 LONGEST = 500  # substeps of a gradient: 3 MB each
 
@@ -29,7 +29,7 @@ class Warp(Contestant):
         gradient = task.quantity == "gradient"
         if gradient and task.substeps > LONGEST:
             raise Unsupported(f"a tape of more than {LONGEST} substeps")
-        sheet = Sheet(arrays(task.scene(), task.substeps), task.substeps, gradient)
+        sheet = Sheet(arrays(task.build_case(), task.substeps), task.substeps, gradient)
         if not gradient:
             wp.load_module(kernels, device="cpu")
             return sheet.forward
@@ -49,7 +49,7 @@ class State:
         self.x, self.v, self.force = zeros(vertices), zeros(vertices), zeros(vertices)
         self.d3, self.pull = zeros(elements), zeros(elements)
         self.C, self.C_element = zeros(vertices, wp.mat33), zeros(elements, wp.mat33)
-        self.grid = zeros((NODES, NODES, NODES), wp.vec4)
+        self.grid = zeros((GRID_NODES_PER_AXIS, GRID_NODES_PER_AXIS, GRID_NODES_PER_AXIS), wp.vec4)
 
 
 class Sheet:
@@ -67,7 +67,7 @@ class Sheet:
             for values, dtype in ((data.faces, wp.vec3i), (data.frame, wp.vec4), (data.area, float))
         )
         self.m_vertex = array((VERTEX_SHARE * data.vertex_mass).astype(np.float32), float)
-        self.m_element, self.held = array(data.element_mass, float), array(data.held, int)
+        self.m_element, self.gripped = array(data.element_mass, float), array(data.gripped, int)
         self.driven = array(data.velocity, wp.vec3)
         self.start = array(data.x, wp.vec3, grad)
         self.youngs = array(np.array([MATERIAL["youngs_modulus"]], np.float32), float, grad)
@@ -95,7 +95,7 @@ class Sheet:
         launch(
             kernels.grid_to_vertices,
             self.V,
-            [s.x, s.grid, self.held, self.driven, k],
+            [s.x, s.grid, self.gripped, self.driven, k],
             [after.x, after.v, after.C],
         )
         launch(
@@ -128,8 +128,8 @@ class Sheet:
         tape.zero()
         self.run()
         tape.backward(loss=self.loss)
-        by_x, by_youngs = self.start.grad.numpy(), float(self.youngs.grad.numpy()[0])
-        return Outcome(self.end(), float(self.loss.numpy()[0]), by_x.copy(), by_youngs)
+        gradient_x, gradient_youngs = self.start.grad.numpy(), float(self.youngs.grad.numpy()[0])
+        return Outcome(self.end(), float(self.loss.numpy()[0]), gradient_x.copy(), gradient_youngs)
 
     def end(self) -> np.ndarray:
         """[V, 3] m."""

@@ -1,4 +1,4 @@
-"""The table for a device: refused in one line where there is none, and made by what a CPU has of its ways."""
+"""The table for a device: refused in one line where there is none, and made by what a CPU has of its paths."""
 
 import sys
 from functools import partial
@@ -9,7 +9,7 @@ import torch
 from torchcloth.benchmarks import devices
 
 
-def asked(monkeypatch, *words: str) -> None:
+def run(monkeypatch, *words: str) -> None:
     monkeypatch.setattr(sys, "argv", ["devices", *words])
     devices.main()
 
@@ -17,23 +17,26 @@ def asked(monkeypatch, *words: str) -> None:
 @pytest.mark.skipif(torch.cuda.is_available(), reason="there is a device")
 def test_without_a_device_it_says_so(monkeypatch, capsys):
     with pytest.raises(SystemExit, match="2"):
-        asked(monkeypatch)
+        run(monkeypatch)
     assert "got no CUDA device, expected one" in capsys.readouterr().err
 
 
-def test_scenes_are_some(monkeypatch, capsys):
+def test_no_scenes_are_refused(monkeypatch, capsys):
     with pytest.raises(SystemExit, match="2"):
-        asked(monkeypatch, "--scenes", "4", "0")
+        run(monkeypatch, "--scenes", "4", "0")
     assert "--scenes: got 0, expected 1 or more" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("how", ["--contact", "--folded"])
-def test_ways_agree_and_are_told(monkeypatch, capsys, how):
-    ways = {"fused, CPU": devices.Way("cpu", "fused"), "one by one": devices.Way("cpu", "reference")}
-    monkeypatch.setattr(devices, "WAYS", ways)
+def test_paths_agree_and_are_listed(monkeypatch, capsys, how):
+    paths = {
+        "fused, CPU": devices.SimulationPath("cpu", "fused"),
+        "one by one": devices.SimulationPath("cpu", "reference"),
+    }
+    monkeypatch.setattr(devices, "PATHS", paths)
     monkeypatch.setattr(devices, "sheet", partial(devices.sheet, cells=8))  # the reference takes minutes for more
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
     monkeypatch.setattr(torch.cuda, "get_device_name", lambda: "none")
-    asked(monkeypatch, "--scenes", "2", how, "--frames", "1", "--repeats", "1")
+    run(monkeypatch, "--scenes", "2", how, "--frames", "1", "--repeats", "1")
     rows = [line.split("|")[1:3] for line in capsys.readouterr().out.splitlines() if line.startswith("| 2")]
     assert [[cell.strip() for cell in row] for row in rows] == [["2", "fused, CPU"], ["2", "one by one"]]

@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 
 from torchcloth.benchmarks import contestants, limits, report
-from torchcloth.benchmarks.cases import engines, make
+from torchcloth.benchmarks.cases import engines, make_case
 from torchcloth.benchmarks.contestant import Outcome, Task
-from torchcloth.benchmarks.measure import Timing, peak, resident, sample
-from torchcloth.benchmarks.ratios import CONVENTIONS, pairs, ratios
-from torchcloth.benchmarks.suite import Bench, Entry, Plan, Turn, rounds
-from torchcloth.benchmarks.worker import Failed
+from torchcloth.benchmarks.measure import Timing, peak, resident_mebibytes, sample
+from torchcloth.benchmarks.ratios import CONVENTIONS, ratio_keys, ratios
+from torchcloth.benchmarks.suite import Bench, BenchPlan, Entry, PreparedRun, measurement_rounds
+from torchcloth.benchmarks.worker import ContestantFailed
 
 ISSUE = (
     "forward_vs_taichi",
@@ -32,54 +32,54 @@ ISSUE = (
 @pytest.fixture
 def made_up():
     """A record for every entry of the full plan: so many seconds as the contestant's name has letters."""
-    plan = Plan(("fused", "reference"), tuple(contestants.PEERS))
-    found = {}
-    for entry in itertools.chain(*rounds(plan)):
+    plan = BenchPlan(("fused", "reference"), tuple(contestants.PEERS))
+    result = {}
+    for entry in itertools.chain(*measurement_rounds(plan)):
         for name in entry.names:
             task = entry.task
-            size = {"substeps": task.substeps, "triangles": task.scene().triangles, "batch": task.batch}
-            found[entry.key(name)] = size | {"seconds": float(len(name)), "ms_per_substep": 1.0}
-    return found
+            size = {"substeps": task.substeps, "triangles": task.build_case().triangles, "batch": task.batch}
+            result[entry.key(name)] = size | {"seconds": float(len(name)), "ms_per_substep": 1.0}
+    return result
 
 
 def test_ratios_come_from_the_cases(made_up):
     made_up["tangents8.standard.fused"]["seconds"] = 15.0
     made_up["forward.standard.batch-8.fused"]["seconds"] = 20.0
-    found = ratios(made_up, "fused")
-    assert set(ISSUE) <= set(found)
-    assert found["forward_vs_taichi"] == found["forward_250_everywhere_vs_taichi"] == 6 / 5
-    assert found["gradient_vs_warp"] == 4 / 5
-    assert found["forward_vs_eager"] == 9 / 5
-    assert found["tangents8_vs_forward"] == 3.0
-    assert found["batch8_vs_batch1"] == 4.0
-    assert found["linear_in_triangles"] == pytest.approx(800 / 20_000, rel=1e-3)
-    assert found["linear_in_substeps"] == pytest.approx(0.1)
+    result = ratios(made_up, "fused")
+    assert set(ISSUE) <= set(result)
+    assert result["forward_vs_taichi"] == result["forward_250_everywhere_vs_taichi"] == 6 / 5
+    assert result["gradient_vs_warp"] == 4 / 5
+    assert result["forward_vs_eager"] == 9 / 5
+    assert result["tangents8_vs_forward"] == 3.0
+    assert result["batch8_vs_batch1"] == 4.0
+    assert result["linear_in_triangles"] == pytest.approx(800 / 20_000, rel=1e-3)
+    assert result["linear_in_substeps"] == pytest.approx(0.1)
 
 
 def test_without_peers_their_ratios_are_left_out(made_up):
-    found = ratios({key: r for key, r in made_up.items() if not key.endswith("warp")}, "fused")
-    assert not any("warp" in name for name in found)
-    assert "forward_vs_taichi" in found
+    result = ratios({key: r for key, r in made_up.items() if not key.endswith("warp")}, "fused")
+    assert not any("warp" in name for name in result)
+    assert "forward_vs_taichi" in result
 
 
 def test_conventions_speak_of_ratios_that_exist(made_up):
-    found = ratios(made_up, "fused")
+    result = ratios(made_up, "fused")
     for name in ("tangents8_vs_forward", "gradient_vs_forward", "batch8_vs_batch1"):
-        assert name in found
+        assert name in result
         assert any(name in convention for convention in CONVENTIONS)
 
 
 def test_entries_have_keys_of_their_own():
     for fast in (False, True):
-        plan = Plan(("fused", "reference"), tuple(contestants.PEERS), fast=fast)
-        keys = [entry.key(name) for entry in itertools.chain(*rounds(plan)) for name in entry.names]
+        plan = BenchPlan(("fused", "reference"), tuple(contestants.PEERS), fast=fast)
+        keys = [entry.key(name) for entry in itertools.chain(*measurement_rounds(plan)) for name in entry.names]
         assert len(keys) == len(set(keys))
 
 
 def test_a_ratio_is_of_one_round():
-    plan = Plan(("fused", "reference"), tuple(contestants.PEERS))
-    of = {e.key(name): k for k, entries in enumerate(rounds(plan)) for e in entries for name in e.names}
-    for name, (above, below) in pairs("fused").items():
+    plan = BenchPlan(("fused", "reference"), tuple(contestants.PEERS))
+    of = {e.key(name): k for k, entries in enumerate(measurement_rounds(plan)) for e in entries for name in e.names}
+    for name, (above, below) in ratio_keys("fused").items():
         assert of[above] == of[below], name
 
 
@@ -95,7 +95,7 @@ class Ready:
 
     def sample(self, task, shortest):
         if task.quantity == self.ends_in:
-            raise Failed("killed")
+            raise ContestantFailed("killed")
         return 1.0
 
     def result(self, task):
@@ -103,9 +103,9 @@ class Ready:
 
 
 def test_who_ends_leaves_the_round_and_nobody_else_does():
-    x = Task("standard", "forward", 20, small=True).scene().mesh.vertices + np.array([0.0, 0.0, -1e-4])
+    x = Task("standard", "forward", 20, small=True).build_case().mesh.vertices + np.array([0.0, 0.0, -1e-4])
     right = Outcome(x, 1.0, np.ones_like(x), 1.0)
-    bench = Bench(Plan(("fused", "reference"), samples=2))
+    bench = Bench(BenchPlan(("fused", "reference"), samples=2))
     bench._workers.update(fused=Ready(right, ends_in="gradient"), reference=Ready(right))
     entries = [Entry(Task("standard", q, 20, small=True), ("fused", "reference")) for q in ("forward", "gradient")]
     bench.measure(entries)
@@ -119,23 +119,23 @@ def test_who_ends_leaves_the_round_and_nobody_else_does():
 
 @pytest.mark.parametrize("question", ["result", "forget"])
 def test_who_ends_after_its_last_sample_takes_nobody_along(question):
-    x = Task("standard", "forward", 20, small=True).scene().mesh.vertices + np.array([0.0, 0.0, -1e-4])
+    x = Task("standard", "forward", 20, small=True).build_case().mesh.vertices + np.array([0.0, 0.0, -1e-4])
     right = Outcome(x, 1.0, np.ones_like(x), 1.0)
     bench, entry = (
-        Bench(Plan(("fused", "reference"))),
+        Bench(BenchPlan(("fused", "reference"))),
         Entry(Task("standard", "forward", 20, small=True), ("fused", "reference")),
     )
     dying = Ready(right)
 
     def ends(*task):
-        raise Failed("killed")
+        raise ContestantFailed("killed")
 
     setattr(dying, question, ends)
     bench._workers.update(fused=dying, reference=Ready(right))
     bench.measure([entry])
-    lost = {entry.key("fused")} if question == "result" else set()
-    assert set(bench.notes) == lost
-    assert set(bench.records) == {entry.key(name) for name in entry.names} - lost
+    dropped = {entry.key("fused")} if question == "result" else set()
+    assert set(bench.notes) == dropped
+    assert set(bench.records) == {entry.key(name) for name in entry.names} - dropped
     assert set(bench._workers) == {"reference"}
 
 
@@ -145,21 +145,25 @@ def test_who_ends_after_its_last_sample_takes_nobody_along(question):
 def test_who_is_wrong_is_not_counted_and_condemns_nobody(broken, counted):
     """Whoever comes first."""
     task = Task("standard", "gradient", 20, small=True)
-    x = task.scene().mesh.vertices + np.array([0.0, 0.0, -1e-4])
+    x = task.build_case().mesh.vertices + np.array([0.0, 0.0, -1e-4])
     right = Outcome(x, 1.0, np.ones_like(x), 1.0)
     wrong = Outcome(np.full_like(x, np.nan), 1.0, np.ones_like(x), 1.0)
-    bench, entry = Bench(Plan(("fused", "reference"))), Entry(task, ("fused", "reference"))
-    bench._judge(entry, {n: Turn(Ready(wrong if n == broken else right), 0.0, [1.0]) for n in entry.names})
+    bench, entry = Bench(BenchPlan(("fused", "reference"))), Entry(task, ("fused", "reference"))
+    bench._record_valid(
+        entry, {n: PreparedRun(Ready(wrong if n == broken else right), 0.0, [1.0]) for n in entry.names}
+    )
     assert set(bench.records) == {entry.key(name) for name in counted}
     assert len(bench.notes) == 2 - len(counted)
 
 
 def test_the_fused_engine_is_held_against_the_reference():
     task = Task("standard", "gradient", 20, small=True)
-    x = task.scene().mesh.vertices + np.array([0.0, 0.0, -1e-4])
+    x = task.build_case().mesh.vertices + np.array([0.0, 0.0, -1e-4])
     right, other = Outcome(x, 1.0, np.ones_like(x), 1.0), Outcome(x, 1.0, -7 * np.ones_like(x), 1.0)
-    bench, entry = Bench(Plan(("fused", "reference"))), Entry(task, ("fused", "reference"))
-    bench._judge(entry, {"fused": Turn(Ready(other), 0.0, [1.0]), "reference": Turn(Ready(right), 0.0, [1.0])})
+    bench, entry = Bench(BenchPlan(("fused", "reference"))), Entry(task, ("fused", "reference"))
+    bench._record_valid(
+        entry, {"fused": PreparedRun(Ready(other), 0.0, [1.0]), "reference": PreparedRun(Ready(right), 0.0, [1.0])}
+    )
     assert set(bench.records) == {entry.key("reference")}
     assert "derivative by positions" in bench.notes[entry.key("fused")]
 
@@ -174,22 +178,22 @@ def test_samples_are_seconds_of_one_run():
 
 
 def test_memory_is_seen():
-    """Pages of its own: a heap may hold on to what an earlier test freed, and hand out what is resident already."""
-    before = resident()
+    """Pages of its own: a heap may hold on to what an earlier test freed, and hand out resident pages."""
+    before = resident_mebibytes()
     with mmap.mmap(-1, 64 * 2**20) as block:
         block[:: mmap.PAGESIZE] = b"x" * len(block[:: mmap.PAGESIZE])
-        assert resident() - before == pytest.approx(64, abs=8)
-        assert peak() >= resident() - 1
+        assert resident_mebibytes() - before == pytest.approx(64, abs=8)
+        assert peak() >= resident_mebibytes() - 1
 
 
 def test_limits_of_this_machine():
-    found = limits.measure(1)
-    assert 1e9 < found.bytes_per_second < 1e12
-    assert 1e9 < found.flops_per_second < 1e12
-    case = make("standard-everywhere")
-    counts, alone = limits.counts(case, 800), limits.counts(case, 0)
+    result = limits.measure(1)
+    assert 1e9 < result.bytes_per_second < 1e12
+    assert 1e9 < result.flops_per_second < 1e12
+    case = make_case("standard-everywhere")
+    counts, alone = limits.count_operations(case, 800), limits.count_operations(case, 0)
     assert counts.flops > 5 * alone.flops
-    distance = found.distance(counts, 1e-3)
+    distance = result.distance(counts, 1e-3)
     assert distance["times_the_limit"] == pytest.approx(1.0 / max(distance["arithmetic_ms"], distance["memory_ms"]))
 
 
@@ -212,7 +216,7 @@ def test_the_command_says_one_object(tmp_path):
     assert done.returncode == 0, done.stderr
     (line,) = done.stdout.splitlines()
     result = json.loads(line)
-    assert {"machine", "cases", "ratios", "conventions", "limits", "notes", "absent"} == set(result)
+    assert {"machine", "cases", "ratios", "conventions", "limits", "notes", "missing_peers", "schema"} == set(result)
     assert result["notes"] == {}
     best = engines()[0]
     for quantity in ("forward", "gradient", "tangents8"):
@@ -238,5 +242,5 @@ def test_wrong_arguments_are_one_line(tmp_path):
 
 def test_a_missing_peer_is_named_with_its_remedy(monkeypatch):
     monkeypatch.setattr(contestants, "find_spec", lambda name: None)
-    assert set(contestants.absent()) == set(contestants.PEERS)
-    assert "pip install warp-lang" in contestants.absent()["warp"]
+    assert set(contestants.missing_peers()) == set(contestants.PEERS)
+    assert "pip install warp-lang" in contestants.missing_peers()["warp"]
