@@ -9,12 +9,12 @@ from helpers import stretched_sheets, twins
 
 from torchcloth import recordings as rec
 from torchcloth.episodes import streams
-from torchcloth.episodes.unknowns import collect
+from torchcloth.episodes.unknowns import collect_unknowns
 from torchcloth.errors import InvalidInput, RecordingError
 from torchcloth.identification import build_episode, identify
 from torchcloth.identification.estimators.objective import Objective
-from torchcloth.identification.nuisances import chosen
-from torchcloth.identification.residuals.blocks import blocks_for
+from torchcloth.identification.nuisances import select_nuisances
+from torchcloth.identification.residuals.blocks import select_blocks
 
 GRASP = {"grasp": 1e-3}
 
@@ -44,7 +44,7 @@ def test_streams_share_one_list_of_times(pulled, model):
 def test_markers_lie_on_their_material_points(pulled, model):
     seen = build_episode(model, pulled)
     flat = torch.nn.functional.pad(torch.as_tensor(model.mesh.uv), (0, 1))
-    np.testing.assert_allclose(seen.marker_places.on(flat)[:, :2].numpy(), pulled.markers.uv, atol=1e-12)
+    np.testing.assert_allclose(seen.marker_places.interpolate(flat)[:, :2].numpy(), pulled.markers.uv, atol=1e-12)
     uv = pulled.markers.uv.copy()
     uv[3] = [-0.1, 0.1]
     off = replace(pulled, markers=replace(pulled.markers, uv=uv))
@@ -78,12 +78,12 @@ def test_the_distance_is_from_what_is_in_use(pulled, model, use):
         "markers": replace(pulled, markers=replace(pulled.markers, xyz=pulled.markers.xyz + 0.05)),
         "force": replace(pulled, grippers=grip),
     }
-    unknowns = collect(model, ["youngs_modulus"], None)
+    unknowns = collect_unknowns(model, ["youngs_modulus"], None)
     asked = {
-        kind: Objective(model, unknowns, [build_episode(model, recording)], blocks=blocks_for(use))
+        kind: Objective(model, unknowns, [build_episode(model, recording)], blocks=select_blocks(use))
         for kind, recording in {"as it is": pulled, **off}.items()
     }
-    found = {kind: objective.distance(objective.start) for kind, objective in asked.items()}
+    found = {kind: objective.mean_distance(objective.start) for kind, objective in asked.items()}
     assert [kind for kind in off if found[kind] > 2 * found["as it is"]] == [use]
     assert [kind for kind in off if found[kind] == found["as it is"]] == [kind for kind in off if kind != use]
 
@@ -98,7 +98,7 @@ def test_means_of_a_signal_between_frames():
     """Of a parabola through its knots: the trapezoidal rule is exact for what lies linearly between them."""
     t = np.array([0.0, 0.1, 0.3, 0.4])
     value = np.stack([t, np.full(4, 2.0), [0.0, 1.0, 1.0, 0.0]], axis=1)
-    mean = streams._means(t, value, np.array([0.0, 0.2, 0.4]))
+    mean = streams._interval_means(t, value, np.array([0.0, 0.2, 0.4]))
     assert np.isnan(mean[0]).all()
     np.testing.assert_allclose(mean[1:, 0], [0.1, 0.3])
     np.testing.assert_allclose(mean[1:, 1], 2.0)
@@ -108,7 +108,7 @@ def test_means_of_a_signal_between_frames():
 def test_a_lost_reading_takes_its_interval_and_no_other():
     t = np.arange(6) / 10
     value = np.stack([t, np.where(t == 0.2, np.nan, t)], axis=1)
-    mean = streams._means(t, value, np.array([0.0, 0.1, 0.25, 0.4, 0.45]))
+    mean = streams._interval_means(t, value, np.array([0.0, 0.1, 0.25, 0.4, 0.45]))
     np.testing.assert_allclose(mean[1:, 0], [0.05, 0.175, 0.325, 0.425])
     np.testing.assert_allclose(mean[1:, 1], [0.05, np.nan, np.nan, 0.425])
 
@@ -131,12 +131,12 @@ def test_forces_are_those_of_the_rollout(pulled, model):
 
 
 def test_each_kind_has_a_scale_of_its_own(pulled, model):
-    problem = Objective(model, collect(model, ["youngs_modulus"], None), [build_episode(model, pulled)])
+    problem = Objective(model, collect_unknowns(model, ["youngs_modulus"], None), [build_episode(model, pulled)])
     linear = problem.linearise(problem.start)
     assert [b.name for b in problem.blocks] == ["points", "edges", "markers", "force", "torque"]
     assert sorted(set(linear.block.tolist())) == [0, 1, 2, 3]
     for block, unit in ((2, 1e-2), (3, 1.0)):  # metres and newtons, from a start that is off
-        assert 0.01 * unit < float(linear.value[linear.block == block].abs().median()) < unit
+        assert 0.01 * unit < float(linear.residual[linear.block == block].abs().median()) < unit
 
 
 def test_force_gives_stiffness_without_a_density(pulled, model):
@@ -158,7 +158,7 @@ def test_an_offset_that_is_not_fitted_widens_the_error(pulled, model):
 
 def test_use_is_checked(pulled, model):
     with pytest.raises(InvalidInput, match=r"use; got 'forces'; expected some of points, markers, force"):
-        blocks_for(["forces"])
+        select_blocks(["forces"])
     still = replace(pulled, grippers={n: replace(m, force=None) for n, m in pulled.grippers.items()})
     with pytest.raises(InvalidInput, match="which no episode has"):
         identify(model, still, ["youngs_modulus"], use=["force"])
@@ -178,8 +178,8 @@ def test_a_point_far_from_everything_does_not_count(pulled, model):
 
 def test_one_name_may_stand_for_a_list_and_numbers_for_nothing(pulled, model):
     """Letter by letter, "points" was "got 'p'"."""
-    assert blocks_for("markers") == blocks_for(["markers"])
-    assert [type(n) for n in chosen("clock")] == [type(n) for n in chosen(["clock"])]
+    assert select_blocks("markers") == select_blocks(["markers"])
+    assert [type(n) for n in select_nuisances("clock")] == [type(n) for n in select_nuisances(["clock"])]
     with pytest.raises(InvalidInput, match="got 'youngs_modulu'; expected one of"):
         identify(model, pulled, "youngs_modulu")
     with pytest.raises(InvalidInput, match=r"prior of youngs_modulus; got 2.0; expected \(value, factor > 1\)"):

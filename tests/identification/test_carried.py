@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from torchcloth.episodes.pattern_interpolation import between, carried
+from torchcloth.episodes.pattern_interpolation import interpolation_weights, interpolate_on_pattern
 from torchcloth.errors import InvalidInput
 from torchcloth.meshes import Mesh, rectangle
 
@@ -23,7 +23,7 @@ def test_quadratics_come_out_everywhere(crooked):
     uv = mesh.uv + crooked * RNG.uniform(-1, 1, mesh.uv.shape) * inside[:, None]
     mesh = Mesh.build(np.c_[uv, np.zeros(len(uv))], mesh.faces, uv)
     places = RNG.random((200, 2)) * [0.3, 0.2]
-    found = carried(between(mesh, places), torch.as_tensor(np.stack([quadratic(uv), uv[:, 0]], 1)).expand(2, 3, -1, -1))
+    found = interpolate_on_pattern(interpolation_weights(mesh, places), torch.as_tensor(np.stack([quadratic(uv), uv[:, 0]], 1)).expand(2, 3, -1, -1))
     assert found.shape == (2, 3, 200, 2)
     np.testing.assert_allclose(found[1, 2].T, [quadratic(places), places[:, 0]], atol=1e-8)
 
@@ -32,7 +32,7 @@ def test_many_vertices_cost_little():
     """Most stay where they are, and have no other in their rows."""
     mesh = rectangle(0.5, 0.5, resolution=(81, 81))
     places = mesh.uv + np.where(np.linalg.norm(mesh.uv, axis=1) < 0.03, 1e-3, 0.0)[:, None]
-    weights = between(mesh, places)
+    weights = interpolation_weights(mesh, places)
     moved = (places != mesh.uv).any(1).sum()
     assert 0 < moved < 40
     found = weights.to_dense()[(places == mesh.uv).all(1)]
@@ -42,9 +42,9 @@ def test_many_vertices_cost_little():
 def test_vertices_are_what_they_are():
     mesh = rectangle(0.3, 0.2, resolution=(5, 4))
     values = RNG.standard_normal(len(mesh.uv))
-    np.testing.assert_allclose(between(mesh, mesh.uv).to_dense().numpy() @ values, values, atol=1e-12)
+    np.testing.assert_allclose(interpolation_weights(mesh, mesh.uv).to_dense().numpy() @ values, values, atol=1e-12)
 
 
 def test_beside_the_pattern_is_nothing():
     with pytest.raises(InvalidInput, match=r"off the cloth.*on its pattern"):
-        between(rectangle(0.3, 0.2), np.array([[0.35, 0.1]]))
+        interpolation_weights(rectangle(0.3, 0.2), np.array([[0.35, 0.1]]))

@@ -11,7 +11,7 @@ from helpers import least_squares, twins
 from torchcloth import recordings, synthesis
 from torchcloth.episodes.observed import build_cloth, build_episode
 from torchcloth.episodes.replay import Frames
-from torchcloth.episodes.unknowns import collect
+from torchcloth.episodes.unknowns import collect_unknowns
 from torchcloth.errors import SimulationDiverged
 from torchcloth.identification import identify
 from torchcloth.identification.estimators import (
@@ -21,7 +21,7 @@ from torchcloth.identification.estimators import (
     statistical_linearisation,
 )
 from torchcloth.identification.estimators.objective import Objective
-from torchcloth.identification.nuisances import chosen
+from torchcloth.identification.nuisances import select_nuisances
 from torchcloth.identification.residuals.blocks import BLOCKS
 
 TRUE = {"youngs_modulus": 129.32e3, "air.normal": 1.2}
@@ -60,11 +60,11 @@ def test_a_light_sheet_that_buckles_is_identified_from_what_can_be_predicted(swu
 
 def test_tangents_of_a_light_sheet_run_away_and_those_of_its_beginning_do_not(swung):
     model = build_cloth(swung)
-    whole = Objective(model, collect(model, list(TRUE), None), [build_episode(model, swung)], nuisances=chosen([], ["rim"]))
-    for objective, away in ((whole, True), (whole.part(0.3), False)):
+    whole = Objective(model, collect_unknowns(model, list(TRUE), None), [build_episode(model, swung)], nuisances=select_nuisances([], ["rim"]))
+    for objective, away in ((whole, True), (whole.first_fraction(0.3), False)):
         linear = objective.linearise(objective.start)
         assert (
-            linearity.runaway(objective, levenberg_marquardt.judged(objective.problem(), objective.start, linear))
+            linearity.has_runaway_tangents(objective, levenberg_marquardt.evaluate_point(objective.problem(), objective.start, linear))
             == away
         )
 
@@ -80,7 +80,7 @@ class Rippling:
 
     nuisances, blocks = (), BLOCKS[:1]
     cloth = SimpleNamespace(boundaries={})
-    episodes = (SimpleNamespace(settles=False, noise=None),)
+    episodes = (SimpleNamespace(needs_settling=False, noise_std=None),)
 
     def __init__(self, seed: int, blind: bool = False) -> None:
         generator = torch.Generator().manual_seed(seed)
@@ -114,7 +114,7 @@ class Rippling:
         factor, nothing = torch.ones_like(value), value.new_zeros(len(value), 3)
         return levenberg_marquardt.Linearised(value, nothing, factor, self.frame, self.patch)
 
-    def seen(self, raw):
+    def observe(self, raw):
         x = torch.stack([raw, 2 * raw])[None]
         return [Frames(x, 0 * x, {}, torch.zeros(1))]
 
@@ -122,14 +122,14 @@ class Rippling:
         return float((self._shown(raw) - self.data).abs().mean())
 
 
-FAILED = linearity.Checked(SimpleNamespace(raw=torch.zeros(3, dtype=torch.float64)), None, [], [], "chaotic")
+FAILED = linearity.LinearityCheck(SimpleNamespace(raw=torch.zeros(3, dtype=torch.float64)), None, [], [], "chaotic")
 
 
 def test_simulations_around_a_point_see_through_ripples():
     """20 problems: unbiased, errors of the size that is stated, some times smaller than the ripples would make them."""
     z, stds = [], []
     for seed in range(20):
-        found = statistical_linearisation.resolved(Rippling(seed), FAILED, None, 8, lambda raw: None)
+        found = statistical_linearisation.fit_by_sampling(Rippling(seed), FAILED, None, 8, lambda raw: None)
         deviation = found.covariance.diagonal().sqrt()
         z.append((found.final.raw - least_squares.TRUE) / deviation)
         stds.append(deviation)
@@ -138,11 +138,11 @@ def test_simulations_around_a_point_see_through_ripples():
     assert abs(float(z.mean())) < 0.4
     assert 0.6 < float(z.std()) < 1.4
     assert float(torch.stack(stds).mean()) < 0.2
-    assert float(found.reach.position[0]) == pytest.approx(math.sqrt(0.5 * (1 + 4)), rel=1e-6)
+    assert float(found.influence.position[0]) == pytest.approx(math.sqrt(0.5 * (1 + 4)), rel=1e-6)
 
 
 def test_what_nothing_tells_stays_open_under_ripples():
-    found = statistical_linearisation.resolved(Rippling(0, blind=True), FAILED, None, 8, lambda raw: None)
+    found = statistical_linearisation.fit_by_sampling(Rippling(0, blind=True), FAILED, None, 8, lambda raw: None)
     deviation = found.covariance.diagonal().sqrt()
     assert float(deviation[2]) > 1.0
     assert float(deviation[:2].max()) < 0.3
@@ -165,13 +165,13 @@ def test_it_starts_where_all_frames_are_nearer(monkeypatch, known, failed):
         assert float(posed.prior_mean[0]) == 0.0, "the beginning's"
         raise SimulationDiverged("seen enough")
 
-    monkeypatch.setattr(problem, "distance", distance, raising=False)
-    monkeypatch.setattr(statistical_linearisation, "covariance_of", lambda *_: torch.eye(3, dtype=torch.float64))
-    monkeypatch.setattr(statistical_linearisation, "later", lambda *_: None)
-    monkeypatch.setattr(statistical_linearisation, "_settle", settle)
-    begun = predictability.Within(problem, FAILED._replace(final=at["k"]), 0.5)
+    monkeypatch.setattr(problem, "mean_distance", distance, raising=False)
+    monkeypatch.setattr(statistical_linearisation, "solution_covariance", lambda *_: torch.eye(3, dtype=torch.float64))
+    monkeypatch.setattr(statistical_linearisation, "rows_after_part", lambda *_: None)
+    monkeypatch.setattr(statistical_linearisation, "_search", settle)
+    begun = predictability.PredictableFit(problem, FAILED._replace(final=at["k"]), 0.5)
     assert (
-        statistical_linearisation.resolved(problem, FAILED._replace(final=at["f"]), begun, 8, lambda raw: None) is None
+        statistical_linearisation.fit_by_sampling(problem, FAILED._replace(final=at["f"]), begun, 8, lambda raw: None) is None
     )
     assert starts == [0.0 if known == 0.0 else 1.0]
 
@@ -181,7 +181,7 @@ def test_what_cannot_be_simulated_around_is_left_as_it_was():
         def evaluate_all(self, raw):
             raise SimulationDiverged("torn")
 
-    assert statistical_linearisation.resolved(Torn(0), FAILED, None, 8, lambda raw: None) is None
+    assert statistical_linearisation.fit_by_sampling(Torn(0), FAILED, None, 8, lambda raw: None) is None
 
 
 def test_the_beginning_grows_until_derivatives_fail(monkeypatch):
@@ -192,20 +192,20 @@ def test_the_beginning_grows_until_derivatives_fail(monkeypatch):
     asked = []
 
     def motion(frames):
-        return SimpleNamespace(times=torch.arange(frames) / 10.0, observed=frames)
+        return SimpleNamespace(times=torch.arange(frames) / 10.0, observed_count=frames)
 
-    def solved(objective, share, start, on_iterate, tolerance):
+    def solved(objective, share, start, on_iterate, tolerance, settings):
         asked.append((share, float(start), tolerance))
         part = SimpleNamespace(
-            episodes=[SimpleNamespace(times=torch.arange(round(100 * share)) / 10.0, observed=round(100 * share))]
+            episodes=[SimpleNamespace(times=torch.arange(round(100 * share)) / 10.0, observed_count=round(100 * share))]
         )
         final = levenberg_marquardt.Iterate(torch.tensor(share), *[None] * 5)
-        checked = linearity.Checked(final, None, [], [])
+        checked = linearity.LinearityCheck(final, None, [], [])
         return (part, checked) if 0.12 < share < 0.45 else None
 
-    monkeypatch.setattr(predictability, "_solved", solved)
+    monkeypatch.setattr(predictability, "_solve_part", solved)
     whole = SimpleNamespace(episodes=[motion(100)])
-    found = predictability.within(whole, FAILED, torch.tensor(0.0), lambda it, o: False)
+    found = predictability.fit_predictable_part(whole, FAILED, torch.tensor(0.0), lambda it, o: False)
     shares, starts, tolerances = zip(*asked, strict=True)
     assert shares == pytest.approx([0.1, 0.15, 0.22, 0.33, 0.5, 0.415, 0.4575, 0.415])
     assert starts == pytest.approx([0.0, 0.0, 0.15, 0.22, 0.33, 0.33, 0.415, 0.415])
@@ -218,7 +218,7 @@ def test_of_the_beginning_combinations_are_known_as_such():
     told, known = torch.zeros(3, dtype=torch.float64), torch.eye(3, dtype=torch.float64)
     known[0, 1] = known[1, 0] = -0.95
     known[2, 2] = 1e6  # less than the fit's own prior
-    problem = statistical_linearisation._after(Rippling(0).problem(), told, 0.01 * known)
+    problem = statistical_linearisation._with_prior(Rippling(0).problem(), told, 0.01 * known)
     torch.testing.assert_close(torch.linalg.inv(problem.precision)[:2, :2], 0.01 * known[:2, :2])
     assert float(problem.prior_std[2]) == float(Rippling(0).problem().prior_std[2])
     assert float(problem.precision[2, 2]) == pytest.approx(float(problem.prior_std[2]) ** -2)

@@ -6,8 +6,8 @@ import math
 import numpy as np
 import pytest
 
-from torchcloth.episodes.unknowns import available
-from torchcloth.identification import drawn
+from torchcloth.episodes.unknowns import find_scalar_parameters
+from torchcloth.identification import sample_posterior
 
 
 @pytest.fixture
@@ -26,12 +26,12 @@ def fit(pair, recording, tmp_path):
 
 
 def values(cloth, name):
-    return cloth.get_submodule(available(cloth)[name]).value.item()
+    return cloth.get_submodule(find_scalar_parameters(cloth)[name]).value.item()
 
 
 def test_the_first_is_the_fit_and_the_others_scatter_as_it_says(fit):
     folder, recording, names = fit
-    cloths = drawn(folder, recording, 200)
+    cloths = sample_posterior(folder, recording, 200)
     content = json.loads((folder / "identification.json").read_text())["model"]["values"]
     table = np.array([[values(c, name) for name in names] for c in cloths])
     assert table[0] == pytest.approx([content[name] for name in names])
@@ -46,7 +46,7 @@ def test_what_nobody_knows_stays_a_fabric(fit, tmp_path):
     for name in names:
         content["parameters"][name]["std"] = 1e3 * content["model"]["values"][name]
     (tmp_path / "identification.json").write_text(json.dumps(content))
-    cloths = drawn(tmp_path, recording, 20)
+    cloths = sample_posterior(tmp_path, recording, 20)
     for name in names:
         own = [values(c, name) for c in cloths]
         assert min(own) >= 0
@@ -58,7 +58,7 @@ def test_what_nobody_knows_stays_a_fabric(fit, tmp_path):
 
 def test_the_same_seed_draws_the_same(fit):
     folder, recording, names = fit
-    one, two, other = (drawn(folder, recording, 3, seed)[2] for seed in (1, 1, 2))
+    one, two, other = (sample_posterior(folder, recording, 3, seed)[2] for seed in (1, 1, 2))
     assert values(one, names[0]) == values(two, names[0]) != values(other, names[0])
 
 
@@ -69,5 +69,5 @@ def test_an_amplitude_is_drawn_by_its_errors_alone(fit, tmp_path):
     content["model"]["values"]["air.normal"] = 40.0
     content["parameters"]["air.normal"]["std"] = 5.0
     (tmp_path / "identification.json").write_text(json.dumps(content))
-    own = [values(c, "air.normal") for c in drawn(tmp_path, recording, 200)]
+    own = [values(c, "air.normal") for c in sample_posterior(tmp_path, recording, 200)]
     assert np.std(own) == pytest.approx(5.0, rel=0.2)

@@ -5,10 +5,10 @@ import torch
 
 import torchcloth as tc
 from torchcloth.episodes.observed import Episode
-from torchcloth.episodes.observed_surface import BAND, sheet_of
+from torchcloth.episodes.observed_surface import RIM_BAND_M, build_surface_of_mesh
 from torchcloth.episodes.replay import Frames
 from torchcloth.identification.residuals.edges import edge_rows
-from torchcloth.identification.residuals.rows import scene_of
+from torchcloth.identification.residuals.rows import match_points
 from torchcloth.training.fit.losses import Loss
 
 SIDE = 0.3
@@ -33,12 +33,12 @@ def scene(cloud, moved=None, length=0.1, mesh=MESH, held=None):
     x = torch.as_tensor(mesh.vertices).expand(len(cloud), -1, -1)
     nothing = x.new_zeros(len(cloud))
     episode = Episode("fake", {}, torch.arange(len(cloud)) * 0.1, cloud, x[0], True, 1e-3)
-    return scene_of(Frames(x, 0 * x, {}, nothing), moved, episode, sheet_of(mesh, held, length))
+    return match_points(Frames(x, 0 * x, {}, nothing), moved, episode, build_surface_of_mesh(mesh, held, length))
 
 
 def offset(cloud, **options):
     """(mean [m], its standard error) over all frames and pieces."""
-    value = edge_rows(scene(cloud, **options)).value
+    value = edge_rows(scene(cloud, **options)).residual
     value = value[value != 0]
     return float(value.mean()), float(value.std() / len(value) ** 0.5)
 
@@ -55,7 +55,7 @@ def test_noise_moves_the_rim_by_twice_its_variance_over_the_band():
     """As the file's head says: 2 mm of noise, 0.5 mm."""
     generator = torch.Generator().manual_seed(0)
     found, error = offset(clouds(0.0, generator, blur=2e-3))
-    assert found == pytest.approx(2 * (2e-3) ** 2 / BAND, abs=3 * error + 0.15e-3)
+    assert found == pytest.approx(2 * (2e-3) ** 2 / RIM_BAND_M, abs=3 * error + 0.15e-3)
 
 
 def test_what_is_hidden_does_not_pull():
@@ -68,7 +68,7 @@ def test_what_is_hidden_does_not_pull():
 
 def test_a_piece_without_points_says_nothing():
     rows = edge_rows(scene(clouds(0.0, torch.Generator().manual_seed(0), hidden=lambda uv: uv[:, 0] < 0.1)))
-    left = rows.value.reshape(FRAMES - 1, -1) == 0
+    left = rows.residual.reshape(FRAMES - 1, -1) == 0
     assert int(left.all(0).sum()) >= 3  # of the hidden side
     assert not bool(left.all(0).all())
 
@@ -80,15 +80,15 @@ def test_the_slope_is_that_of_the_rim():
     grow = (x - x.mean(0)) / (SIDE / 2)  # 1 at every side, across it
     moved = Frames(grow.expand(1, FRAMES, -1, -1), 0 * grow.expand(1, FRAMES, -1, -1), {}, torch.zeros(1, FRAMES))
     rows = edge_rows(scene(cloud, moved))
-    assert float(rows.jacobian[rows.value != 0].mean()) == pytest.approx(-1.0, abs=1e-6)
-    shifted = [edge_rows(scene(clouds(d, torch.Generator().manual_seed(1)))).value.mean() for d in (0.0, 2e-3)]
+    assert float(rows.jacobian[rows.residual != 0].mean()) == pytest.approx(-1.0, abs=1e-6)
+    shifted = [edge_rows(scene(clouds(d, torch.Generator().manual_seed(1)))).residual.mean() for d in (0.0, 2e-3)]
     assert float(shifted[1] - shifted[0]) == pytest.approx(2e-3, rel=0.1)
 
 
 def test_held_sides_are_no_rim():
-    held = MESH.nearest_vertices([[0.0, v / 20 * SIDE] for v in range(21)], 0.01)
-    assert sheet_of(MESH, held, 0.1).rim.count == 9
-    assert sheet_of(MESH, None, 0.1).rim.count == 12
+    held = MESH.vertices_near_pattern_points([[0.0, v / 20 * SIDE] for v in range(21)], 0.01)
+    assert build_surface_of_mesh(MESH, held, 0.1).rim.piece_count == 9
+    assert build_surface_of_mesh(MESH, None, 0.1).rim.piece_count == 12
 
 
 def test_another_layer_is_not_beyond_the_rim():
@@ -103,8 +103,8 @@ def test_another_layer_is_not_beyond_the_rim():
     faces = torch.as_tensor(MESH.faces)[torch.randint(len(MESH.faces), (FRAMES, 600), generator=generator)]
     cloud = list((weights.unsqueeze(-1) * x[faces]).sum(-2))
     given = scene(cloud)
-    rows = edge_rows(scene_of(given.seen._replace(x=x.expand(FRAMES, -1, -1)), None, given.episode, given.sheet))
-    seen = rows.value[rows.value != 0]
+    rows = edge_rows(match_points(given.frames._replace(x=x.expand(FRAMES, -1, -1)), None, given.episode, given.surface))
+    seen = rows.residual[rows.residual != 0]
     assert abs(float(seen.mean())) < 1.5e-3
 
 

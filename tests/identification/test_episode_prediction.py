@@ -11,12 +11,12 @@ from helpers import twins
 
 import torchcloth as tc
 from torchcloth import recordings as rec
-from torchcloth.episodes.replay import Frames, simulate, tangents
-from torchcloth.episodes.unknowns import collect
+from torchcloth.episodes.replay import Frames, simulate, simulate_with_tangents
+from torchcloth.episodes.unknowns import collect_unknowns
 from torchcloth.errors import InvalidInput, RecordingError, UnstableStep
 from torchcloth.identification import build_cloth, build_episode, episode_prediction, predict_episode
-from torchcloth.identification.episode_prediction import _held_to_steps, with_errors
-from torchcloth.identification.prediction_report import print_predicted
+from torchcloth.identification.episode_prediction import _replace_wrong_tangents, propagate_errors
+from torchcloth.identification.prediction_report import print_episode_prediction
 
 
 @pytest.fixture(scope="module")
@@ -42,7 +42,7 @@ def test_what_was_not_fitted_is_as_near_as_what_was(found, pair):
 def test_the_error_is_that_of_finite_steps(found, pair, other):
     """A tenth of a standard error of each parameter, with their correlation, through whole simulations."""
     cloth = found.cloth
-    unknowns = collect(cloth, list(pair.correlation), None)
+    unknowns = collect_unknowns(cloth, list(pair.correlation), None)
     raw = torch.tensor([u.start for u in unknowns])
     std = torch.tensor([pair.parameters[u.name].std / u.slope(u.start) for u in unknowns])
     data = build_episode(cloth, other)
@@ -68,12 +68,12 @@ def test_the_interval_holds_what_is_measured(found, pair):
 def test_only_forces_are_compared_where_there_is_nothing_else(pair, other, tmp_path, capsys):
     grip = {name: replace(m, force=np.tile([0.0, 0.0, 0.4], (len(m.t), 1))) for name, m in other.grippers.items()}
     felt = predict_episode(pair.save(tmp_path), replace(other, points=None, grippers=grip))
-    print_predicted(felt)
+    print_episode_prediction(felt)
     printed = capsys.readouterr().out
     assert "nan" not in printed
     assert "force rms N" in printed
     assert "no points and no markers" in printed
-    assert felt.as_dict()["interval"]["inside"] is None
+    assert felt.as_dict()["interval"]["coverage"] is None
 
 
 def test_what_it_says_is_json(found):
@@ -96,7 +96,7 @@ def test_what_nobody_has_seen_yet_is_predicted_along_its_motion(pair, other, tmp
         predict_episode(pair.save(tmp_path), replace(other, points=None, grippers=brief))
     assert found.as_dict()["std_parameters"]["rms"] > 0
     assert set(found.as_dict()["measured"].values()) == {None}
-    print_predicted(found)
+    print_episode_prediction(found)
     assert "nothing was seen or felt in this episode to compare with" in capsys.readouterr().out
 
 
@@ -113,7 +113,7 @@ def test_another_model_is_refused(pair, other, tmp_path):
         predict_episode(path, other)
 
 
-def test_tangents_of_an_unstable_motion_are_held_to_steps():
+def test_tangents_of_an_unstable_motion_are_replace_wrong_tangents():
     """A sheet that buckles: by tangents a vertex was known to metres, where a standard error moves it by 2 cm."""
     mesh = tc.meshes.rectangle(0.4, 0.4, resolution=(8, 8))
     t, (u, v) = np.linspace(0.0, 0.6, 61), mesh.uv.T
@@ -134,11 +134,11 @@ def test_tangents_of_an_unstable_motion_are_held_to_steps():
     swing = rec.Recording(cloth=info, grasps=grasps, grippers=hands, points=clouds, **said)
     with twins.doubles():
         cloth = build_cloth(swing)
-        data, unknowns = build_episode(cloth, swing), collect(cloth, ["youngs_modulus", "air.normal"], None)
+        data, unknowns = build_episode(cloth, swing), collect_unknowns(cloth, ["youngs_modulus", "air.normal"], None)
         raw, covariance = torch.tensor([u.start for u in unknowns]), torch.diag(torch.tensor([0.02, 0.03]) ** 2)
-        both = tangents(cloth, unknowns, raw, data)
-        moved, lost, untried = _held_to_steps(cloth, unknowns, raw, data, None, both, covariance)
-        before, after = (with_errors(cloth, data, both[0], m, covariance, 1e-3).std for m in (both[1], moved))
+        both = simulate_with_tangents(cloth, unknowns, raw, data)
+        moved, lost, untried = _replace_wrong_tangents(cloth, unknowns, raw, data, None, both, covariance)
+        before, after = (propagate_errors(cloth, data, both[0], m, covariance, 1e-3).vertex_std for m in (both[1], moved))
     assert lost
     assert not untried
     assert float(after.max()) < 0.2
@@ -159,8 +159,8 @@ def test_a_standard_error_more_that_cannot_be_simulated_is_tried_as_one_less(mon
 
     monkeypatch.setattr(episode_prediction, "simulate", simulate)
     slopes = Frames(*(torch.zeros(1, *part.shape) for part in still[:2]), {}, torch.zeros(1, 2))
-    moved, lost, untried = _held_to_steps(
-        None, [unknown], torch.zeros(1), None, None, (still, slopes), torch.eye(1) * std**2
+    moved, lost, untried = _replace_wrong_tangents(
+        None, [unknown], torch.zeros(1), None, None, still, slopes, torch.eye(1) * std**2
     )
     assert tried == [1, -1]
     assert (lost, untried) == ((["stiffness"], []) if possible else ([], ["stiffness"]))

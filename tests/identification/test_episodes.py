@@ -13,11 +13,11 @@ import torchcloth as tc
 from torchcloth import recordings as rec
 from torchcloth.episodes import streams
 from torchcloth.episodes.observed import find_depth_camera, compute_initial_vertices, build_mesh
-from torchcloth.episodes.unknowns import available, collect
+from torchcloth.episodes.unknowns import find_scalar_parameters, collect_unknowns
 from torchcloth.errors import InvalidInput, RecordingError
 from torchcloth.identification import build_cloth, build_episode, identify
 from torchcloth.identification.estimators.objective import Objective
-from torchcloth.identification.uncertainty.richardson import finer_cloth, finer_recording
+from torchcloth.identification.uncertainty.richardson import refine_cloth, refine_recording
 
 
 def with_cloth(recording, **changes):
@@ -61,8 +61,8 @@ def test_patches_end_where_they_are_said_to_and_the_first_shape_is_carried_there
     for radius in (0.036, 0.045):
         held = replace(given, grasps={**given.grasps, "left": rec.GraspInfo(corner, radius)})
         cloth = build_cloth(held)
-        fine = finer_cloth(cloth)
-        for model, episode_ in ((cloth, held), (fine, finer_recording(held, cloth.mesh, fine.mesh))):
+        fine = refine_cloth(cloth)
+        for model, episode_ in ((cloth, held), (fine, refine_recording(held, cloth.mesh, fine.mesh))):
             uv = model.mesh.uv
             mine = uv[model.boundaries["left"].index.numpy()]
             assert mine[mine[:, 1] == 0, 0].max() == pytest.approx(radius, rel=1e-9)
@@ -157,7 +157,7 @@ def test_a_cloud_beside_the_cloth_says_so(recording, model):
     points = recording.points
     shifted = replace(recording, points=replace(points, xyz=points.xyz + np.array([0.3, 0.0, 0.0])))
     (doubt,) = build_episode(model, shifted).data_warnings()
-    assert re.search(r"lies \(\+(29|30|31)\d, [+-]\d+, [+-]\d+\) mm from the cloth: check T_world_camera", doubt)
+    assert re.search(r"lie \(\+(29|30|31)\d, [+-]\d+, [+-]\d+\) mm from the cloth: check T_world_camera", doubt)
     x = build_episode(model, recording).initial
     half = replace(build_episode(model, recording), clouds=[x[x[:, 0] > x[:, 0].median()]])
     assert half.data_warnings() == []
@@ -241,15 +241,15 @@ def test_a_step_is_half_of_what_is_typical_with_a_sign_and_without():
     mesh = tc.meshes.rectangle(0.1, 0.1, resolution=(3, 3))
     effects = {"rest": tc.effects.RestShape(shrink_warp=0.0), "air": tc.effects.AirDrag(1.0)}
     cloth = tc.Cloth(mesh, tc.materials.AEP(1e5), 0.2, effects, contact=None)
-    found = collect(cloth, ["rest.shrink_warp", "air.normal", "youngs_modulus"], None)
-    assert [u.longest_step / u.size for u in found] == [0.5, 0.5, 1.0]
-    assert found[0].longest_step == pytest.approx(0.01)
+    found = collect_unknowns(cloth, ["rest.shrink_warp", "air.normal", "youngs_modulus"], None)
+    assert [u.max_step / u.typical_change for u in found] == [0.5, 0.5, 1.0]
+    assert found[0].max_step == pytest.approx(0.01)
 
 
 def test_unknowns_by_public_name(model):
-    names = set(available(model))
+    names = set(find_scalar_parameters(model))
     assert names >= {"youngs_modulus", "poisson_ratio", "air.normal", "bending.stiffness", "areal_density"}
-    one = collect(model, ["air.normal", "youngs_modulus", "air.normal"], (0.3, 0.005))
+    one = collect_unknowns(model, ["air.normal", "youngs_modulus", "air.normal"], (0.3, 0.005))
     assert [u.name for u in one] == ["air.normal", "youngs_modulus", "areal_density"]
     assert [u.measured for u in one] == [False, False, True]
     assert one[2].prior_std == pytest.approx(0.005 / 0.3)  # of the logarithm
@@ -258,16 +258,16 @@ def test_unknowns_by_public_name(model):
 
 
 def test_slopes_are_those_of_the_values(model):
-    for unknown in collect(model, ["youngs_modulus", "poisson_ratio", "air.normal"], None):
+    for unknown in collect_unknowns(model, ["youngs_modulus", "poisson_ratio", "air.normal"], None):
         h = 1e-5
         finite = (unknown.value(unknown.start + h) - unknown.value(unknown.start - h)) / (2 * h)
         assert unknown.slope(unknown.start) == pytest.approx(finite, rel=1e-6)
 
 
 def test_values_and_raw_are_inverse(model, recording):
-    problem = Objective(model, collect(model, ["youngs_modulus", "poisson_ratio"], None), [build_episode(model, recording)])
+    problem = Objective(model, collect_unknowns(model, ["youngs_modulus", "poisson_ratio"], None), [build_episode(model, recording)])
     values = {"youngs_modulus": 3.3e4, "poisson_ratio": 0.31}
-    assert problem.values(problem.raw(values)) == pytest.approx(values)
+    assert problem.physical_values(problem.start_with(values)) == pytest.approx(values)
 
 
 # -- what identify() refuses before it simulates ---------------------------------------------------------------------

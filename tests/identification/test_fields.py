@@ -11,8 +11,8 @@ from helpers import stretched_sheets
 import torchcloth as tc
 from torchcloth.errors import InvalidInput
 from torchcloth.identification import fields, fit_fields, identify
-from torchcloth.identification.fields import NO_ERROR, laplacian
-from torchcloth.identification.residuals.blocks import blocks_for
+from torchcloth.identification.fields import NO_ERROR_NOTE, triangle_laplacian
+from torchcloth.identification.residuals.blocks import select_blocks
 
 STIFF = 4.0  # times, in the stripe
 
@@ -75,10 +75,10 @@ def test_a_field_goes_downhill_and_says_that_it_has_no_error(striped, tmp_path):
     assert not fit.fit["converged"]
     content = json.loads(fit.save(tmp_path).read_text())
     entry = content["fields"]["youngs_modulus"]
-    assert entry["std"] == NO_ERROR == "no error: gradient method"
+    assert entry["std"] == NO_ERROR_NOTE == "no error: gradient method"
     assert entry["values"] == fit.fields["youngs_modulus"].tolist()
-    assert content["contrast"] == fit.contrast
-    assert NO_ERROR in content["warnings"][0]
+    assert content["contrast"] == fit.prior_contrast
+    assert NO_ERROR_NOTE in content["warnings"][0]
     again = fit_fields(model, recording, ["youngs_modulus"], iterations=3, journal=tmp_path / "j", resume=True)
     assert torch.equal(again.fields["youngs_modulus"], fit.fields["youngs_modulus"])
     assert again.history == fit.history
@@ -90,7 +90,7 @@ def test_a_field_goes_downhill_and_says_that_it_has_no_error(striped, tmp_path):
 def test_the_prior_of_a_slope_does_not_depend_on_the_mesh(resolution):
     """A field that rises by 1 across a square: its roughness is near 1, on any mesh; a constant has none."""
     mesh = tc.meshes.rectangle(0.3, 0.3, resolution=resolution)
-    matrix = laplacian(mesh)
+    matrix = triangle_laplacian(mesh)
     assert float((matrix @ torch.ones(len(matrix), dtype=torch.float64)).abs().max()) < 1e-9
     rise = torch.as_tensor(np.asarray(mesh.vertices)[np.asarray(mesh.faces)].mean(1)[:, 0]) / 0.3
     assert float(rise @ matrix @ rise) == pytest.approx(1.0, rel=0.2)
@@ -100,7 +100,7 @@ def test_the_prior_of_a_slope_does_not_depend_on_the_mesh(resolution):
 def test_panels_that_lie_on_each_other_are_neighbours_as_any_others(gap):
     """Across a side seam of a shirt that lies flat the centres of two triangles are next to each other in space."""
     mesh = tc.meshes.shirt(triangles=300, gap=gap)
-    matrix = laplacian(mesh)
+    matrix = triangle_laplacian(mesh)
     pairs = -matrix[matrix < 0]
     assert bool(matrix.isfinite().all())
     assert float(pairs.max()) < 6 * float(pairs.median())
@@ -110,7 +110,7 @@ def test_panels_that_lie_on_each_other_are_neighbours_as_any_others(gap):
 def test_distances_of_centres_are_those_of_triangles_side_by_side():
     mesh = tc.meshes.rectangle(0.3, 0.2, resolution=(5, 4))
     flat, faces = np.asarray(mesh.vertices), np.asarray(mesh.faces)
-    centres, matrix = flat[faces].mean(1), laplacian(mesh)
+    centres, matrix = flat[faces].mean(1), triangle_laplacian(mesh)
     for a, b in zip(*np.nonzero(np.triu(matrix.numpy(), 1)), strict=True):
         i, j = set(faces[a]) & set(faces[b])
         weight = np.linalg.norm(flat[i] - flat[j]) / np.linalg.norm(centres[a] - centres[b])
@@ -161,7 +161,7 @@ def test_pieces_of_cloth_that_do_not_touch_have_a_prior_each():
     )
     cloth = with_field(tc.Cloth(two, tc.materials.AEP(1e5, 0.3), 0.2), torch.full((len(faces),), 1e5))
     own = {"youngs_modulus": cloth.material.youngs_modulus}
-    prior = fields._Fields(cloth, own, [], None, blocks_for(None), 1.0).root
+    prior = fields._FieldObjective(cloth, own, [], None, select_blocks(None), 1.0).root
     covariance = torch.linalg.inv(prior @ prior.mT)
     count = len(one.faces)
     assert float(covariance[:count, :count].mean()) == pytest.approx(math.log(10) ** 2)
@@ -179,7 +179,7 @@ def test_where_clouds_end_is_no_datum_of_a_field(striped, monkeypatch):
         seen.append([block.name for block in blocks])
         raise Stop
 
-    monkeypatch.setattr(fields, "_Fields", made)
+    monkeypatch.setattr(fields, "_FieldObjective", made)
     recording = striped(frames=2, points=20)
     for use in (None, "points"):
         with pytest.raises(Stop):

@@ -9,21 +9,21 @@ from helpers import twins
 
 import torchcloth as tc
 from torchcloth.boundaries import Grasp
-from torchcloth.episodes.unknowns import collect
+from torchcloth.episodes.unknowns import collect_unknowns
 from torchcloth.errors import InvalidInput, SimulationDiverged
 from torchcloth.identification import fit, identify
 from torchcloth.identification.estimators.objective import Objective
-from torchcloth.identification.uncertainty.richardson import finer_cloth, finer_recording
+from torchcloth.identification.uncertainty.richardson import refine_cloth, refine_recording
 
 PAIR = ["youngs_modulus", "air.normal"]
 
 
 def test_the_finer_mesh_is_the_same_cloth(model, recording):
-    fine = finer_cloth(model)
+    fine = refine_cloth(model)
     assert len(fine.mesh.faces) == 4 * len(model.mesh.faces)
     assert fine.mesh.area.sum() == pytest.approx(model.mesh.area.sum(), rel=1e-12)
     assert float(fine.material.youngs_modulus.value) == float(model.material.youngs_modulus.value)
-    episode = finer_recording(recording, model.mesh, fine.mesh)
+    episode = refine_recording(recording, model.mesh, fine.mesh)
     first, coarse = episode.cloth.initial_vertices, recording.cloth.initial_vertices
     np.testing.assert_array_equal(first[: len(coarse)], coarse)
     assert np.abs(first).max() <= np.abs(coarse).max()
@@ -31,13 +31,13 @@ def test_the_finer_mesh_is_the_same_cloth(model, recording):
 
 def test_a_finer_mesh_keeps_the_gap_between_layers(model):
     touching = tc.Cloth(model.mesh, tc.materials.AEP(1e5), 0.2)
-    assert finer_cloth(touching).grid().spacing == touching.grid().spacing
+    assert refine_cloth(touching).contact_grid().spacing == touching.contact_grid().spacing
 
 
 def test_a_grip_holds_the_new_vertices_between_those_it_held():
     mesh = tc.meshes.rectangle(0.2, 0.2, resolution=(3, 3))
     sheet = tc.Cloth(mesh, tc.materials.AEP(1e5), 0.2, boundaries={"bar": Grasp([0, 1, 2])}, contact=None)
-    fine = finer_cloth(sheet)
+    fine = refine_cloth(sheet)
     held = np.asarray(fine.mesh.uv)[fine.boundaries["bar"].index]
     assert sorted(held[:, 1].round(6).tolist()) == [0.0, 0.05, 0.1, 0.15, 0.2]
     assert (held[:, 0] == 0).all()
@@ -59,7 +59,7 @@ def test_a_patch_that_ends_between_vertices_holds_no_more_of_a_finer_mesh(grip):
     mesh = tc.meshes.rectangle(0.2, 0.2, resolution=(3, 3))
     mesh = tc.meshes.Mesh.build(mesh.vertices, mesh.faces, mesh.uv, {"lower-left": [0]})
     sheet = tc.Cloth(mesh, tc.materials.AEP(1e5), 0.2, boundaries={"grip": grip}, contact=None)
-    fine = finer_cloth(sheet)
+    fine = refine_cloth(sheet)
     coarse, now = (np.asarray(c.mesh.uv)[c.boundaries["grip"].index.numpy()] for c in (sheet, fine))
     assert (now.min(0), now.max(0)) == (pytest.approx(coarse.min(0)), pytest.approx(coarse.max(0)))
     assert len(now) >= 2 * len(coarse) - 1  # those between
@@ -68,10 +68,10 @@ def test_a_patch_that_ends_between_vertices_holds_no_more_of_a_finer_mesh(grip):
 
 def test_a_residual_force_is_no_parameter_and_no_obstacle(model):
     """As in the extended model of a diagnosis: its strengths are not fitted, and it stays on the finer mesh."""
-    law = tc.effects.ResidualForce({"across": 0.1, "mass@edge": 0.01}, held=[0, 1])
+    law = tc.effects.ResidualForce({"across": 0.1, "mass@edge": 0.01}, gripped_vertices=[0, 1])
     cloth = tc.Cloth(model.mesh, tc.materials.AEP(1e5), 0.2, {"residual": law}, contact=None)
     assert "residual.strength" not in fit.default_parameters(cloth)
-    fine = finer_cloth(cloth)
+    fine = refine_cloth(cloth)
     assert fine.effects["residual"].held == (0, 1)
     assert len(fine.effects["residual"].share) == len(fine.mesh.vertices)
 
@@ -93,34 +93,34 @@ def test_a_finer_mesh_that_cannot_be_simulated_leaves_the_fit_and_says_so(model,
     def torn(*_):
         raise SimulationDiverged("the cloth is torn apart")
 
-    monkeypatch.setattr(fit, "mesh_step", torn)
+    monkeypatch.setattr(fit, "mesh_correction", torn)
     found = identify(model, brief, ["youngs_modulus"], iterations=1, refine=True)
     assert found.parameters == one_step.parameters
-    assert "mesh_step" not in found.fit
+    assert "mesh_correction" not in found.fit
     assert any("not corrected for the coarseness of the mesh: on a finer one, the cloth" in w for w in found.warnings)
 
 
 def test_it_moves_towards_what_a_finer_mesh_finds(recording, model, plain):
     """The truth has 11 x 11 vertices, the model 7 x 7; a fit on 13 x 13, which costs eight times as much, judges."""
     moved = identify(model, recording, PAIR, refine=True)
-    fine = finer_cloth(model)
-    judge = identify(fine, finer_recording(recording, model.mesh, fine.mesh), PAIR)
+    fine = refine_cloth(model)
+    judge = identify(fine, refine_recording(recording, model.mesh, fine.mesh), PAIR)
     for name in PAIR:
         a, b, c = (fit.parameters[name].value for fit in (plain, moved, judge))
         assert abs(b - c) < max(0.7 * abs(a - c), 0.3 * judge.parameters[name].std), name
         assert moved.parameters[name].std >= 0.999 * plain.parameters[name].std * b / a
-    assert moved.fit["mesh_step"] > 0
-    assert "mesh_step" not in plain.fit
+    assert moved.fit["mesh_correction"] > 0
+    assert "mesh_correction" not in plain.fit
     assert torch.equal(plain.frames_before[0], moved.frames_before[0])
 
 
 @pytest.mark.slow
 def test_a_mesh_that_is_fine_already_is_hardly_corrected(recording):
     """With the truth's own spacing halved the step is below a standard error."""
-    fine = finer_cloth(twins.at(recording))
-    episode = finer_recording(recording, twins.at(recording).mesh, fine.mesh)
+    fine = refine_cloth(twins.at(recording))
+    episode = refine_recording(recording, twins.at(recording).mesh, fine.mesh)
     coarse, finer = (
-        identify(c, r, PAIR, refine=True).fit["mesh_step"]
+        identify(c, r, PAIR, refine=True).fit["mesh_correction"]
         for c, r in ((twins.at(recording), recording), (fine, episode))
     )
     assert finer < 0.6 * coarse
@@ -133,7 +133,7 @@ def test_a_sewn_mesh_keeps_its_pattern():
     law = tc.materials.OrthotropicAEP(2e6, 2e5, 1e4, thickness=1e-3)
     grip = {"left": tc.boundaries.Grasp.at("left shoulder")}
     coarse = tc.Cloth(mesh, law, 0.15, boundaries=grip, contact=None)
-    fine = finer_cloth(coarse)
+    fine = refine_cloth(coarse)
     for stretch in ([1.05, 1.0, 1.0], [1.0, 1.05, 1.0]):
         own, other = (
             sum(c.energy(c.state(torch.as_tensor(c.mesh.vertices * stretch))).values()).item() for c in (coarse, fine)
@@ -159,7 +159,7 @@ def _later(g, by):
 
 
 def test_a_correction_that_cannot_be_simulated_is_none(model, brief, one_step, monkeypatch):
-    seen, longest = Objective.seen, collect(model, ["youngs_modulus"], None)[0].longest_step
+    seen, longest = Objective.observe, collect_unknowns(model, ["youngs_modulus"], None)[0].max_step
 
     def torn_elsewhere(self, raw):
         if float(raw[0] - ended[0]) > 0.05 * longest:
@@ -170,11 +170,11 @@ def test_a_correction_that_cannot_be_simulated_is_none(model, brief, one_step, m
         ended.append(float(final.raw[0]))
         moved = torch.zeros_like(final.raw)
         moved[0] = 0.1 * longest
-        monkeypatch.setattr(Objective, "seen", torn_elsewhere)
+        monkeypatch.setattr(Objective, "observe", torn_elsewhere)
         return moved
 
     ended = []
-    monkeypatch.setattr(fit, "mesh_step", step)
+    monkeypatch.setattr(fit, "mesh_correction", step)
     found = identify(model, brief, ["youngs_modulus"], iterations=1, refine=True)
     assert found.parameters == one_step.parameters
     assert any("not corrected for the coarseness of the mesh: on a finer one, the cloth" in w for w in found.warnings)

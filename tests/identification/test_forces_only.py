@@ -13,8 +13,8 @@ from helpers import stretched_sheets, twins
 from torchcloth.episodes import streams
 from torchcloth.episodes.replay import Frames
 from torchcloth.errors import InvalidInput, RecordingError
-from torchcloth.identification import build_cloth, draw, build_episode, identify, print_fit, replayed
-from torchcloth.identification.residuals.rigid_carry import CARRIED, STAYS, UNFELT, no_better_than
+from torchcloth.identification import build_cloth, save_fit_pictures, build_episode, identify, print_fit, replay_fit
+from torchcloth.identification.residuals.rigid_carry import CARRIED_NULL, STATIC_NULL, ZERO_FORCE_NULL, find_unbeaten_null
 
 STIFFNESS = ["youngs_modulus"]
 
@@ -68,17 +68,17 @@ def test_what_was_not_seen_is_null_on_disk_and_a_dash_in_the_table(fit, felt, tm
     print_fit(fit)
     row = next(line for line in capsys.readouterr().out.splitlines() if "fitted values" in line)
     assert row.split()[-3:] == ["–", "–", f"{fit.fit['force_rms_after']:.6f}"]
-    again = replayed(path, felt)
+    again = replay_fit(path, felt)
     assert again.warning == ""
     assert len(again.chamfer) == 0
     shifted = {name: replace(m, force=m.force + 0.1) for name, m in felt.grippers.items()}
-    assert again.fitted
-    assert not replayed(path, replace(felt, grippers=shifted)).fitted
+    assert again.was_fitted
+    assert not replay_fit(path, replace(felt, grippers=shifted)).was_fitted
 
 
 def test_its_pictures_show_forces(fit, felt, tmp_path):
     (tmp_path / "fit.png").write_text("of an earlier fit, to points")
-    drawn = draw(fit, [build_episode(build_cloth(felt), felt)], build_cloth(felt).mesh.faces, tmp_path)
+    drawn = save_fit_pictures(fit, [build_episode(build_cloth(felt), felt)], build_cloth(felt).mesh.faces, tmp_path)
     assert [p.name for p in drawn] == ["forces.png", "parameters.png"]
     assert sorted(p.name for p in tmp_path.iterdir()) == ["forces.png", "parameters.png"]
 
@@ -100,14 +100,14 @@ def test_a_fit_is_held_against_the_null_of_the_data_that_tell(felt):
         scene = SimpleNamespace(uses=uses, episodes=[data], faces=torch.as_tensor(model.mesh.faces))
         x = torch.stack(list(data.clouds)) + shift
         wrench = {n: force * w.nan_to_num() for n, w in data.wrenches.items()}
-        return no_better_than(scene, [Frames(x, 0 * x, wrench, torch.zeros(len(x), 0))])
+        return find_unbeaten_null(scene, [Frames(x, 0 * x, wrench, torch.zeros(len(x), 0))])
 
     assert told(still, "points", "force") == ""
-    assert told(still, "points", "force", force=-1.0) == UNFELT
+    assert told(still, "points", "force", force=-1.0) == ZERO_FORCE_NULL
     assert told(still, "points") == ""
-    assert told(still, "points", shift=0.5) == STAYS
+    assert told(still, "points", shift=0.5) == STATIC_NULL
     assert told(moved, "points", "force", force=-1.0) == ""
-    assert told(moved, "points", "force", shift=0.5) == CARRIED
+    assert told(moved, "points", "force", shift=0.5) == CARRIED_NULL
     assert told(moved, "force", shift=0.5) == ""
 
 

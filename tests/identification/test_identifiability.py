@@ -7,17 +7,17 @@ import pytest
 import torch
 from helpers import stretched_sheets, twins
 
-from torchcloth.episodes.unknowns import collect
+from torchcloth.episodes.unknowns import collect_unknowns
 from torchcloth.identification import identify
 from torchcloth.identification.uncertainty.estimates import Estimate
-from torchcloth.identification.uncertainty.identifiability import Reach, combinations, experiment_for, influences
+from torchcloth.identification.uncertainty.identifiability import ParameterInfluence, find_combinations, suggest_experiment, describe_influences
 
 NAMES = ("youngs_modulus", "areal_density", "air.normal")
 
 
 @pytest.fixture
 def unknowns(model):
-    return collect(model, NAMES, None)
+    return collect_unknowns(model, NAMES, None)
 
 
 def start(unknowns):
@@ -32,7 +32,7 @@ def after(information, unknowns):
 def test_a_ratio_that_alone_is_known_is_named(unknowns):
     """ln E - ln rho to 2 %, nothing else: positions without force."""
     slope = torch.tensor([1.0, -1.0, 0.0])
-    found = combinations(unknowns, start(unknowns), after(torch.outer(slope, slope) / 0.02**2, unknowns))
+    found = find_combinations(unknowns, start(unknowns), after(torch.outer(slope, slope) / 0.02**2, unknowns))
     known = [c for c in found if c.determined]
     assert len(known) == 1
     assert set(known[0].powers) == {"youngs_modulus", "areal_density"}
@@ -43,7 +43,7 @@ def test_a_ratio_that_alone_is_known_is_named(unknowns):
 
 def test_parameters_that_are_known_alone_are_no_combination(unknowns):
     information = torch.diag(torch.tensor([1e4, 1e2, 1e3]))
-    assert combinations(unknowns, start(unknowns), after(information, unknowns)) == []
+    assert find_combinations(unknowns, start(unknowns), after(information, unknowns)) == []
 
 
 def test_nuisances_are_allowed_for(unknowns):
@@ -53,22 +53,22 @@ def test_nuisances_are_allowed_for(unknowns):
     prior = torch.diag(torch.tensor([*(u.prior_std**-2 for u in unknowns), 0.0]))
     marginal = torch.linalg.inv(information + prior)
     assert float(marginal[0, 0]) ** 0.5 == pytest.approx(0.5, rel=0.05)
-    assert not [c for c in combinations(unknowns, start(unknowns), marginal) if c.determined]
+    assert not [c for c in find_combinations(unknowns, start(unknowns), marginal) if c.determined]
 
 
 def test_a_singular_covariance_has_no_combinations(unknowns):
     """As of a motion whose slopes run away: the fit must still be told."""
     for covariance in (torch.ones(3, 3), torch.zeros(3, 3), torch.full((3, 3), torch.inf)):
-        assert combinations(unknowns, start(unknowns), covariance.double()) == []
+        assert find_combinations(unknowns, start(unknowns), covariance.double()) == []
 
 
 def test_reach_is_told_in_millimetres_and_newtons(unknowns):
-    reach = Reach(torch.tensor([2e-3, 1e-3, 0.0]), torch.tensor([0.5, 0.0, 0.0]))
+    reach = ParameterInfluence(torch.tensor([2e-3, 1e-3, 0.0]), torch.tensor([0.5, 0.0, 0.0]))
     known = {n: Estimate(1.0, 0.1, (0.8, 1.2), "-", 1.0, n == "youngs_modulus") for n in NAMES}
-    found = influences(unknowns, start(unknowns), reach, known)
-    assert found["youngs_modulus"].tenth_mm == pytest.approx(0.2)  # of the logarithm
-    assert found["youngs_modulus"].tenth_newton == pytest.approx(0.05)
-    assert found["youngs_modulus"].prior_mm == pytest.approx(2 * math.log(10))
+    found = describe_influences(unknowns, start(unknowns), reach, known)
+    assert found["youngs_modulus"].displacement_per_10_percent_mm == pytest.approx(0.2)  # of the logarithm
+    assert found["youngs_modulus"].force_per_10_percent_n == pytest.approx(0.05)
+    assert found["youngs_modulus"].displacement_per_prior_std_mm == pytest.approx(2 * math.log(10))
     assert found["youngs_modulus"].experiment == ""
     assert found["areal_density"].statement == "not identifiable from these data"
     assert "weigh" in found["areal_density"].experiment
@@ -77,9 +77,9 @@ def test_reach_is_told_in_millimetres_and_newtons(unknowns):
 
 def test_every_parameter_has_an_experiment():
     for name in ("youngs_modulus", "weft_modulus", "bending.stiffness", "bending.damping_time", "cone", "air.wind"):
-        assert experiment_for(name) != experiment_for("something else")
-    assert "force" in experiment_for("youngs_modulus")
-    assert "overhang" in experiment_for("bending.stiffness")
+        assert suggest_experiment(name) != suggest_experiment("something else")
+    assert "force" in suggest_experiment("youngs_modulus")
+    assert "overhang" in suggest_experiment("bending.stiffness")
 
 
 @pytest.mark.slow
@@ -98,4 +98,4 @@ def test_without_force_only_the_ratio_and_with_force_both():
     assert best.powers["areal_density"] / best.powers["youngs_modulus"] == pytest.approx(-1.0, abs=0.4)
     content = felt.as_dict()
     assert set(content["identifiability"]) == set(names)
-    assert SimpleNamespace(**content["identifiability"]["youngs_modulus"]).tenth_newton > 0.01
+    assert SimpleNamespace(**content["identifiability"]["youngs_modulus"]).force_per_10_percent_n > 0.01

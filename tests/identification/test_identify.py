@@ -13,7 +13,7 @@ import torchcloth as tc
 from torchcloth.errors import InvalidInput
 from torchcloth.identification import build_cloth, build_episode, fit_fields, identify
 from torchcloth.identification.estimators import search
-from torchcloth.identification.estimators.gradient_descent import to_vertices
+from torchcloth.identification.estimators.gradient_descent import chamfer_to_nearest_vertex
 
 PAIR = ["youngs_modulus", "air.normal"]
 STATED = 0.005  # kg/m^2, the recording's error of its areal density
@@ -73,9 +73,9 @@ def test_progress_and_history_tell_the_same(fitted):
     assert [c[0] for c in calls] == [h["iteration"] for h in fit.history] == list(range(len(calls)))
     assert [c[1] for c in calls] == [h["chamfer"] for h in fit.history]
     assert all(c[2].items() <= h.items() for c, h in zip(calls, fit.history, strict=True))
-    assert [c[3] for c in calls] == [h["frames"] for h in fit.history]
+    assert [c[3] for c in calls] == [h["frame_fraction"] for h in fit.history]
     assert fit.history[0]["youngs_modulus"] == pytest.approx(8e4)
-    assert fit.history[0]["frames"] < 1 == fit.history[-1]["frames"]
+    assert fit.history[0]["frame_fraction"] < 1 == fit.history[-1]["frame_fraction"]
     assert fit.history[-1]["chamfer"] == pytest.approx(fit.fit["chamfer_after"])
 
 
@@ -197,21 +197,21 @@ def test_the_papers_stop_rule_ends_a_fit_that_is_good_enough(model, brief, monke
     """By the distance that the paper minimises, to vertices: it holds half an edge even where the fit is perfect."""
     seen = build_episode(model, brief)
     with torch.no_grad():
-        start = float(to_vertices(model(model.state(seen.initial), seen.motion, seen.times).x, seen))
-    monkeypatch.setattr(search, "PAPER_CHAMFER", 1.05 * start)
+        start = float(chamfer_to_nearest_vertex(model(model.state(seen.initial), seen.motion, seen.times).x, seen))
+    monkeypatch.setattr(search, "PAPER_STOP_CHAMFER_M", 1.05 * start)
     fit = identify(model, brief, PAIR, method=method, stop="paper")
     assert fit.fit["iterations"] == 0
     assert not fit.fit["converged"]
     assert fit.parameters["youngs_modulus"].value == pytest.approx(8e4)
     assert fit.fit["chamfer_after"] == pytest.approx(fit.fit["chamfer_before"], rel=1e-12)
-    monkeypatch.setattr(search, "PAPER_CHAMFER", 0.95 * start)
+    monkeypatch.setattr(search, "PAPER_STOP_CHAMFER_M", 0.95 * start)
     assert identify(model, brief, PAIR, method=method, stop="paper", iterations=3).fit["iterations"] > 0
 
 
 @pytest.mark.parametrize("options", [{"stop": "paper"}, {"method": "adam", "stop": "paper"}])
 def test_no_search_that_never_moved_presents_its_start_as_the_answer(model, brief, monkeypatch, options):
     """DiffCloth, issue 24: the start value came back as the result. Here the way that is left is in the error."""
-    monkeypatch.setattr(search, "PAPER_CHAMFER", 1.0)
+    monkeypatch.setattr(search, "PAPER_STOP_CHAMFER_M", 1.0)
     fit = identify(model, brief, ["youngs_modulus"], **options)
     found = fit.parameters["youngs_modulus"]
     assert found.value == pytest.approx(found.initial)  # twice the truth
@@ -224,7 +224,7 @@ def test_iterations_are_at_most_what_was_asked(one_step):
     """In each of the two stages; the reader is told that the search was cut short."""
     fit = one_step
     for early in (True, False):
-        assert 1 <= sum((entry["frames"] < 1) == early for entry in fit.history) <= 2  # its start, and one step
+        assert 1 <= sum((entry["frame_fraction"] < 1) == early for entry in fit.history) <= 2  # its start, and one step
     assert fit.fit["converged"] is False
     done = fit.fit["iterations"]
     assert any(w.startswith(f"stopped after {done} iterations before converging") for w in fit.warnings)
@@ -234,7 +234,7 @@ def test_a_guess_is_where_the_search_begins_and_not_what_it_is_compared_with(mod
     guess = {name: pair.parameters[name].value for name in (*PAIR, "areal_density")}
     fit = identify(model, recording, PAIR, guess=guess, warm_start=True)
     assert fit.history[0]["youngs_modulus"] == pytest.approx(guess["youngs_modulus"])
-    assert all(entry["frames"] == 1 for entry in fit.history)  # no early stage: the guess is past it
+    assert all(entry["frame_fraction"] == 1 for entry in fit.history)  # no early stage: the guess is past it
     assert fit.parameters["youngs_modulus"].initial == pytest.approx(8e4)
     assert fit.fit["chamfer_before"] > 2 * fit.history[0]["chamfer"]
     assert fit.fit["iterations"] <= 5  # the rim's offset is found anew

@@ -11,9 +11,9 @@ from helpers import twins
 import torchcloth as tc
 from torchcloth._utils import resume
 from torchcloth._utils.resume import ResumableStore, digest
-from torchcloth.episodes.cloth_facts import cloth_fingerprint_parts
+from torchcloth.episodes.cloth_fingerprint import cloth_fingerprint_parts
 from torchcloth.episodes.observed import build_episode
-from torchcloth.episodes.unknowns import collect
+from torchcloth.episodes.unknowns import collect_unknowns
 from torchcloth.errors import InvalidInput
 from torchcloth.identification import identify
 from torchcloth.identification.estimators.objective import Objective
@@ -69,7 +69,7 @@ def test_stopped_work_is_not_deleted_by_other_work(tmp_path):
 
 def test_another_program_answers_anew(tmp_path, monkeypatch):
     ResumableStore(tmp_path / "j", ["a"], resume=None).get_or_compute("rows", POINT, answer(1.0))
-    monkeypatch.setattr(resume, "program", lambda: "another")
+    monkeypatch.setattr(resume, "source_fingerprint", lambda: "another")
     with pytest.raises(InvalidInput, match="another version of torchcloth"):
         ResumableStore(tmp_path / "j", ["a"], resume=True)
 
@@ -145,15 +145,15 @@ def test_what_is_no_tensor_tells_problems_apart(recording, other):
     ids = []
     for made in (recording, other(recording)):
         cloth = twins.at(made)
-        objective = Objective(cloth, collect(cloth, ["youngs_modulus"], None), [build_episode(cloth, made)])
-        ids.append(digest(objective.identity()))
+        objective = Objective(cloth, collect_unknowns(cloth, ["youngs_modulus"], None), [build_episode(cloth, made)])
+        ids.append(digest(objective.fingerprint_parts()))
     assert ids[0] != ids[1]
 
 
 def test_another_law_with_the_same_numbers_is_another_problem():
     class Heavier(tc.effects.Gravity):
-        def force(self, c, now):
-            return 2 * super().force(c, now)
+        def force(self, c, inputs):
+            return 2 * super().force(c, inputs)
 
     mesh = tc.meshes.rectangle(0.1, 0.1, triangles=8)
     facts = [
@@ -167,8 +167,8 @@ def test_another_engine_is_another_problem(recording):
     """Its last digits differ, and a fit goes on bit by bit."""
     cloth, ids = twins.at(recording), []
     for cloth.engine in ("fused", "reference"):
-        objective = Objective(cloth, collect(cloth, ["youngs_modulus"], None), [build_episode(cloth, recording)])
-        ids.append(digest(objective.identity()))
+        objective = Objective(cloth, collect_unknowns(cloth, ["youngs_modulus"], None), [build_episode(cloth, recording)])
+        ids.append(digest(objective.fingerprint_parts()))
     assert ids[0] != ids[1]
 
 

@@ -8,7 +8,7 @@ from helpers import least_squares
 
 from torchcloth.identification.estimators import levenberg_marquardt, linearity, statistical_linearisation
 from torchcloth.identification.residuals.blocks import BLOCKS
-from torchcloth.identification.uncertainty.identifiability import Reach
+from torchcloth.identification.uncertainty.identifiability import ParameterInfluence
 
 ONE = torch.ones(3, dtype=torch.float64)
 
@@ -26,15 +26,15 @@ def problem():
         unknowns=[SimpleNamespace(name=name) for name in "abc"],
         blocks=BLOCKS[:1],
         cloth=SimpleNamespace(mesh=SimpleNamespace(extent=1e9)),
-        secants=lambda raw, steps: (linear, Reach(ONE, ONE)),
+        linearise_by_differences=lambda raw, steps: (linear, ParameterInfluence(ONE, ONE)),
     )
-    return objective, levenberg_marquardt.judged(solver, 0 * ONE, linear)
+    return objective, levenberg_marquardt.evaluate_point(solver, 0 * ONE, linear)
 
 
 def test_slopes_that_hold_are_not_withdrawn(problem):
-    checked = linearity.check(*problem)
-    assert not checked.withdrawn
-    assert checked.curved == []
+    checked = linearity.check_linearity(*problem)
+    assert not checked.is_withdrawn
+    assert checked.curved_parameters == []
 
 
 @pytest.mark.parametrize("value", [float("nan"), float("inf")])
@@ -42,10 +42,10 @@ def test_finite_steps_that_overflow_withdraw_the_tangents(problem, value):
     objective, final = problem
     broken = final.linear._replace(jacobian=final.linear.jacobian.clone())
     broken.jacobian[0, 1] = value
-    objective.secants = lambda raw, steps: (broken, Reach(ONE, ONE))
-    checked = linearity.check(objective, final)
-    assert checked.withdrawn
-    assert "tangents of b miss finite steps" in checked.reason
+    objective.linearise_by_differences = lambda raw, steps: (broken, ParameterInfluence(ONE, ONE))
+    checked = linearity.check_linearity(objective, final)
+    assert checked.is_withdrawn
+    assert "tangents of b differ from finite steps" in checked.failure_reason
 
 
 def test_without_grippers_that_feel_nothing_reaches_forces():
@@ -56,6 +56,6 @@ def test_without_grippers_that_feel_nothing_reaches_forces():
     near = [
         statistical_linearisation.Sample(raw, raw[:1], (raw @ slope)[None, None], torch.zeros(0, 3)) for raw in raws
     ]
-    reach = statistical_linearisation._reach(objective, near, torch.zeros(2, dtype=torch.float64))
+    reach = statistical_linearisation._influence(objective, near, torch.zeros(2, dtype=torch.float64))
     assert reach.position[0] == pytest.approx(1.0, rel=1e-3)
     assert torch.equal(reach.force, torch.zeros(2, dtype=torch.float64))

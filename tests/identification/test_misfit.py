@@ -9,10 +9,10 @@ from torch import Tensor
 
 import torchcloth as tc
 from torchcloth.episodes.observed import Episode
-from torchcloth.episodes.observed_surface import patch_at, rim_of, share_of, sheet_of
-from torchcloth.identification.residuals.metrics import HUBER, figures, huber, noise_scale
-from torchcloth.identification.residuals.rigid_carry import rigid_carry
-from torchcloth.identification.uncertainty.richardson import finer_cloth
+from torchcloth.episodes.observed_surface import error_group_at, build_rim, compute_pattern_fractions, build_surface_of_mesh
+from torchcloth.identification.residuals.metrics import HUBER_THRESHOLD, distance_metrics, huber, noise_scale
+from torchcloth.identification.residuals.rigid_carry import carry_rigidly
+from torchcloth.identification.uncertainty.richardson import refine_cloth
 
 
 def seen(clouds: list[Tensor], motion=None, initial=None) -> Episode:
@@ -27,7 +27,7 @@ def test_figures_of_points_at_known_heights():
     up = torch.tensor([0.0, 0.0, 1.0])
     clouds = [inside + 0.01 * up, inside[:1] - 0.04 * up]
     frames = flat.expand(2, -1, -1)
-    now = figures([frames], [seen(clouds)], torch.as_tensor(mesh.faces))
+    now = distance_metrics([frames], [seen(clouds)], torch.as_tensor(mesh.faces))
     torch.testing.assert_close(now.per_frame, torch.tensor([0.01, 0.04]))
     assert now.chamfer == pytest.approx(0.025)  # mean over frames, whatever their numbers of points
     assert now.rms == pytest.approx(math.sqrt((3 * 0.01**2 + 0.04**2) / 4))  # over all points
@@ -38,7 +38,7 @@ def test_figures_of_two_episodes_count_every_frame_once():
     flat, up = torch.as_tensor(mesh.vertices), torch.tensor([0.0, 0.0, 1.0])
     point = torch.tensor([[0.5, 0.4, 0.0]])
     one, three = seen([point + 0.01 * up]), seen([point + 0.05 * up] * 3)
-    now = figures([flat.expand(1, -1, -1), flat.expand(3, -1, -1)], [one, three], torch.as_tensor(mesh.faces))
+    now = distance_metrics([flat.expand(1, -1, -1), flat.expand(3, -1, -1)], [one, three], torch.as_tensor(mesh.faces))
     assert now.chamfer == pytest.approx((0.01 + 3 * 0.05) / 4)
 
 
@@ -47,10 +47,10 @@ def test_huber_is_quadratic_then_linear_and_smooth_between():
     loss, weight = huber(z)
     (slope,) = torch.autograd.grad(loss.sum(), z)
     torch.testing.assert_close(slope, weight * z)  # what iteratively reweighted least squares assumes
-    assert torch.equal(weight[z.abs() <= HUBER], torch.ones(int((z.abs() <= HUBER).sum())))
-    far = z.abs() > HUBER
-    torch.testing.assert_close(slope[far], HUBER * z[far].sign())
-    assert float(huber(torch.tensor(HUBER * (1 + 1e-9)))[0]) == pytest.approx(0.5 * HUBER**2)
+    assert torch.equal(weight[z.abs() <= HUBER_THRESHOLD], torch.ones(int((z.abs() <= HUBER_THRESHOLD).sum())))
+    far = z.abs() > HUBER_THRESHOLD
+    torch.testing.assert_close(slope[far], HUBER_THRESHOLD * z[far].sign())
+    assert float(huber(torch.tensor(HUBER_THRESHOLD * (1 + 1e-9)))[0]) == pytest.approx(0.5 * HUBER_THRESHOLD**2)
 
 
 def test_noise_scale_is_robust_and_never_below_the_sensor():
@@ -65,7 +65,7 @@ def test_noise_scale_is_robust_and_never_below_the_sensor():
 
 
 def patches(mesh):
-    return patch_at(share_of(mesh))
+    return error_group_at(compute_pattern_fractions(mesh))
 
 
 def test_patches_cover_the_fabric_in_equal_parts():
@@ -88,21 +88,21 @@ def test_parts_and_rim_are_the_same_on_a_finer_mesh(side, resolution, patterned)
     coarse = tc.meshes.rectangle(side, side, resolution=(resolution, resolution))
     coarse = tc.meshes.Mesh.build(coarse.vertices, coarse.faces, coarse.uv if patterned else None)
     cloth = tc.Cloth(coarse, tc.materials.AEP(1e5, 0.3, thickness=1e-3), 0.2)
-    fine = finer_cloth(cloth).mesh
+    fine = refine_cloth(cloth).mesh
     assert torch.equal(patches(fine)[: len(coarse.vertices)], patches(coarse))
     a, b, c = torch.as_tensor(coarse.faces).T
     inside = torch.tensor([0.6, 0.3, 0.1]).expand(len(a), 3)
     place = (inside[:, :, None] * torch.as_tensor(coarse.vertices)[torch.stack([a, b, c], 1)].to(inside)).sum(1)
     every = (4 * place[:, :2] / side).long()
-    assert torch.equal(sheet_of(coarse).patches_on(torch.stack([a, b, c], 1), inside), 4 * every[:, 0] + every[:, 1])
+    assert torch.equal(build_surface_of_mesh(coarse).error_groups_at(torch.stack([a, b, c], 1), inside), 4 * every[:, 0] + every[:, 1])
     length = side / 10
     middles = []
     for mesh in (coarse, fine):
-        rim = rim_of(mesh, None, length)
+        rim = build_rim(mesh, None, length)
         x = torch.as_tensor(mesh.vertices)
         centre = 0.5 * (x[rim.edges[:, 0]] + x[rim.edges[:, 1]])
-        places = [centre[rim.piece == k].mean(0) for k in range(rim.count)]
-        middles.append(dict(zip(rim.label.tolist(), places, strict=True)))
+        places = [centre[rim.piece == k].mean(0) for k in range(rim.piece_count)]
+        middles.append(dict(zip(rim.labels.tolist(), places, strict=True)))
     one, other = middles
     assert len(other) >= len(one) > 20
     assert all(float((one[k] - other[k]).norm()) < side / (resolution - 1) for k in one)
@@ -111,7 +111,7 @@ def test_parts_and_rim_are_the_same_on_a_finer_mesh(side, resolution, patterned)
 def test_a_closed_surface_has_no_rim():
     corners = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]])
     mesh = tc.meshes.Mesh.build(0.1 * corners, np.array([[0, 2, 1], [0, 1, 3], [1, 2, 3], [0, 3, 2]]))
-    assert rim_of(mesh, None, 0.01).count == 0
+    assert build_rim(mesh, None, 0.01).piece_count == 0
 
 
 def turned(angle: float, axis=(0.3, -0.5, 0.8)) -> Tensor:
@@ -142,14 +142,14 @@ def test_rigid_carry_reproduces_a_rigid_motion(grippers):
     rotation, shift, motion = rigid(count, torch.randn(grippers, 3, generator=generator))
     episode = seen([torch.zeros(1, 3)] * count, motion, shape)
     episode = Episode(**{**vars(episode), "times": torch.linspace(0.0, 1.0, count)})
-    carried = rigid_carry(episode)
+    carried = carry_rigidly(episode)
     torch.testing.assert_close(carried, shape @ rotation.mT + shift[:, None], rtol=0, atol=1e-9)
     torch.testing.assert_close(carried[0], shape, rtol=0, atol=1e-9)
 
 
 def test_rigid_carry_without_grippers_leaves_the_cloth_where_it_is():
     shape = torch.randn(5, 3, generator=torch.Generator().manual_seed(0))
-    assert torch.equal(rigid_carry(seen([torch.zeros(1, 3)] * 3, {}, shape)), shape.expand(3, -1, -1))
+    assert torch.equal(carry_rigidly(seen([torch.zeros(1, 3)] * 3, {}, shape)), shape.expand(3, -1, -1))
 
 
 def test_rigid_carry_of_grippers_that_part_is_the_best_rigid_motion():
@@ -162,4 +162,4 @@ def test_rigid_carry_of_grippers_that_part_is_the_best_rigid_motion():
         motion[name] = tc.Trajectory(t, pose, torch.ones(5, dtype=torch.bool))
     shape = torch.randn(5, 3, generator=torch.Generator().manual_seed(0))
     episode = Episode(**{**vars(seen([torch.zeros(1, 3)] * 5, motion, shape)), "times": t})
-    torch.testing.assert_close(rigid_carry(episode), shape.expand(5, -1, -1), rtol=0, atol=1e-12)
+    torch.testing.assert_close(carry_rigidly(episode), shape.expand(5, -1, -1), rtol=0, atol=1e-12)

@@ -8,11 +8,11 @@ import torch
 from helpers import stretched_sheets, twins
 
 from torchcloth.episodes.replay import Frames, simulate
-from torchcloth.episodes.unknowns import collect
+from torchcloth.episodes.unknowns import collect_unknowns
 from torchcloth.errors import InvalidInput
 from torchcloth.identification import build_episode, identify
 from torchcloth.identification.estimators.objective import Objective
-from torchcloth.identification.nuisances import KINDS, chosen
+from torchcloth.identification.nuisances import NUISANCE_KINDS, select_nuisances
 
 EVERY = ("clock", "camera", "tare", "grasp", "shape")
 
@@ -32,7 +32,7 @@ def near(recording):
 def objective(pulled):
     model = stretched_sheets.model(pulled)
     seen = build_episode(model, pulled).first_fraction(0.3)
-    return Objective(model, collect(model, ["youngs_modulus"], None), [seen, seen], 4e-4, chosen(EVERY, ["rim"]))
+    return Objective(model, collect_unknowns(model, ["youngs_modulus"], None), [seen, seen], 4e-4, select_nuisances(EVERY, ["rim"]))
 
 
 def test_every_unknown_has_its_slope(objective):
@@ -57,16 +57,16 @@ def test_a_first_shape_that_was_not_measured_does_not_settle(pulled):
     """Slopes along where the grippers hold, of cloth that moves from the first frame on."""
     model = stretched_sheets.model(pulled)
     seen = replace(build_episode(model, pulled).first_fraction(0.3), settles=False)
-    found = Objective(model, collect(model, ["youngs_modulus"], None), [seen], 4e-4, chosen(["grasp"]))
+    found = Objective(model, collect_unknowns(model, ["youngs_modulus"], None), [seen], 4e-4, select_nuisances(["grasp"]))
     still = simulate(model, found.unknowns, found.start[:1], seen, 4e-4)
-    torch.testing.assert_close(found.seen(found.start)[0].x, still.x)
+    torch.testing.assert_close(found.observe(found.start)[0].x, still.x)
 
 
 def test_what_a_late_clock_sees_moves_as_fast_as_it_is_seen_to(pulled):
     model = stretched_sheets.model(pulled)
-    seen, own = build_episode(model, pulled).first_fraction(0.3), collect(model, ["youngs_modulus"], None)
-    frames, clock, h = simulate(model, own, torch.tensor([own[0].start]), seen), KINDS["clock"](), 1e-6
-    one, two = (clock.see(frames, torch.tensor([0.004 + d]), seen) for d in (-h, h))
+    seen, own = build_episode(model, pulled).first_fraction(0.3), collect_unknowns(model, ["youngs_modulus"], None)
+    frames, clock, h = simulate(model, own, torch.tensor([own[0].start]), seen), NUISANCE_KINDS["clock"](), 1e-6
+    one, two = (clock.observe(frames, torch.tensor([0.004 + d]), seen) for d in (-h, h))
     torch.testing.assert_close((two.x - one.x)[:-1] / (2 * h), 0.5 * (one.v + two.v)[:-1], rtol=1e-5, atol=1e-6)
 
 
@@ -94,7 +94,7 @@ def test_a_late_clock_far_from_zero_and_in_single_precision(pulled):
     x, v = (f.float()[:, None, None] for f in wave(since))
     frames = Frames(x, v, {}, x.new_zeros(len(since)))
     far = replace(seen, times=seen.times + 1.7e9)
-    late = KINDS["clock"]().see(frames, torch.tensor([5e-3]), far).x[:-1, 0, 0]
+    late = NUISANCE_KINDS["clock"]().observe(frames, torch.tensor([5e-3]), far).x[:-1, 0, 0]
     torch.testing.assert_close(late, wave(since[:-1] + 5e-3)[0].float(), rtol=0, atol=1e-3)
 
 
@@ -107,13 +107,13 @@ def test_a_late_clock_sees_what_comes_after_the_last_frame(pulled):
     assert float(longer.times[-1]) == pytest.approx(float(seen.times[-1]) + 0.09)
     assert [len(longer.clouds[t]) for t in range(len(seen.times), len(longer.times))] == [0, 0]
     assert not bool(longer.markers[len(seen.times) :].isfinite().any())
-    own = collect(model, ["youngs_modulus"], None)
+    own = collect_unknowns(model, ["youngs_modulus"], None)
     raw = torch.tensor([own[0].start])
     truth = simulate(model, own, raw, replace(seen, times=torch.cat([seen.times, seen.times[-1:] + late]))).x[-1]
-    clock = KINDS["clock"]()
+    clock = NUISANCE_KINDS["clock"]()
     errors = []
     for given in (longer, seen):
-        frames = clock.see(simulate(model, own, raw, given), torch.tensor([late]), given)
+        frames = clock.observe(simulate(model, own, raw, given), torch.tensor([late]), given)
         errors.append((frames.x[len(seen.times) - 1] - truth).norm(dim=-1).max().item())
     assert errors[0] < 0.1 * errors[1]
 
@@ -134,12 +134,12 @@ def test_a_shifted_camera_is_found_and_the_fabric_stays(pulled):
 
 
 def test_names_and_deviations():
-    found = chosen({"clock": 0.4, "camera": None}, implied=["rim"])
+    found = select_nuisances({"clock": 0.4, "camera": None}, implied=["rim"])
     assert [(n.name, n.std) for n in found] == [("clock", 0.4), ("camera", 0.002), ("rim", 0.002)]
-    assert chosen({"rim": 0}, implied=["rim"]) == []
-    assert chosen(()) == []
+    assert select_nuisances({"rim": 0}, implied=["rim"]) == []
+    assert select_nuisances(()) == []
     with pytest.raises(InvalidInput, match=r"nuisance; got 'clok'; expected one of clock, camera"):
-        chosen(["clok"])
+        select_nuisances(["clok"])
     with pytest.raises(InvalidInput, match="nuisance clock; got -1"):
-        chosen({"clock": -1.0})
-    assert set(EVERY) < set(KINDS)
+        select_nuisances({"clock": -1.0})
+    assert set(EVERY) < set(NUISANCE_KINDS)

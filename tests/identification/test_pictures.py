@@ -5,7 +5,7 @@ from typing import Any
 
 import torch
 
-from torchcloth.identification.pictures import _felt, parameters, save_figure
+from torchcloth.identification.pictures import _felt, plot_parameters, save_figure
 
 
 def estimate(value, initial, *ci95) -> Any:
@@ -20,7 +20,7 @@ def test_a_wide_interval_of_a_positive_parameter_is_logarithmic(tmp_path):
         "far start": estimate(1.0, 100.0, 0.9, 1.1),
     }
     fit: Any = SimpleNamespace(parameters=shown)
-    figure = parameters(fit)
+    figure = plot_parameters(fit)
     scales = dict(zip(shown, [axis.get_xscale() for axis in figure.axes], strict=True))
     assert scales == {"wide": "log", "narrow": "linear", "signed": "linear", "far start": "log"}
     low, high = figure.axes[0].get_xlim()

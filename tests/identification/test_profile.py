@@ -13,8 +13,9 @@ from torchcloth.errors import InvalidInput
 from torchcloth.identification import identify
 from torchcloth.identification.estimators import levenberg_marquardt
 from torchcloth.identification.uncertainty.estimates import Estimate
-from torchcloth.identification.uncertainty.profile_likelihood import profiles
-from torchcloth.identification.uncertainty.reporting import Found, skewed
+from torchcloth.identification.uncertainty.profile_likelihood import compute_profiles
+from torchcloth.identification.fit_warnings import warn_of_skew
+from torchcloth.identification.uncertainty.estimates import EstimateSet
 
 BEND = 1.0
 
@@ -30,10 +31,10 @@ def toy(model=lambda raw: raw, loud=5.0):
 def profiled(given, clip=lambda raw: raw, names="abc"):
     """(optimum, its covariance by the cost's own curvature, profiles by name)."""
     final = solve(given, start=least_squares.TRUE.clone())
-    covariance = torch.linalg.inv(levenberg_marquardt.curvature(given.problem(), final))
+    covariance = torch.linalg.inv(levenberg_marquardt.robust_curvature(given.problem(), final))
     unknowns = [SimpleNamespace(name=n, clip=clip, value=lambda raw: raw) for n in "abc"]
     objective = SimpleNamespace(problem=given.problem, unknowns=unknowns)
-    return final, covariance, profiles(objective, final, covariance, names, lambda _: False)
+    return final, covariance, compute_profiles(objective, final, covariance, names, lambda _: False)
 
 
 def test_profiles_of_a_linear_problem_are_the_quadratic_intervals():
@@ -44,7 +45,7 @@ def test_profiles_of_a_linear_problem_are_the_quadratic_intervals():
         half = 1.96 * float(covariance[k, k].sqrt())
         assert (high - low) / 2 == pytest.approx(half, rel=0.05)
         assert found[name].skew == pytest.approx(1.0, abs=0.05)
-        assert found[name].rise[len(found[name].rise) // 2] == 0.0
+        assert found[name].cost_rise[len(found[name].cost_rise) // 2] == 0.0
 
 
 def test_profiles_do_not_depend_on_how_a_parameter_is_written():
@@ -68,7 +69,7 @@ def test_an_interval_is_open_where_the_cost_does_not_rise():
     assert high is None
     assert low is not None
     assert found["a"].skew is None
-    assert max(found["a"].rise[-2:]) < 1.92
+    assert max(found["a"].cost_rise[-2:]) < 1.92
     assert None not in found["b"].ci95
 
 
@@ -79,7 +80,7 @@ def test_an_interval_ends_where_the_domain_does():
     _, _, found = profiled(toy(), clip=lambda raw: max(raw, bound), names="a")
     assert found["a"].ci95[0] == bound
     assert found["a"].ci95[1] is not None
-    assert found["a"].rise[0] == pytest.approx(0.5 * 0.7**2, rel=0.1)
+    assert found["a"].cost_rise[0] == pytest.approx(0.5 * 0.7**2, rel=0.1)
 
 
 def test_a_profile_replaces_the_interval_and_can_be_resumed(model, brief, tmp_path):
@@ -119,6 +120,6 @@ def test_a_profile_of_what_is_not_fitted_is_refused(model, brief):
 def test_a_profile_is_offered_where_slopes_change():
     known = Estimate(2.0, 0.1, (1.8, 2.2), "-", 1.0, True)
     lost = Estimate(2.0, 1.9, (0.1, 9.0), "-", 1.0, False)
-    found = Found({"a": known, "b": lost}, {})
-    assert skewed(found, ["b"]) == []
-    assert skewed(found, ["a", "b"])[0].endswith("profile (--profile a) shows it")
+    found = EstimateSet({"a": known, "b": lost}, {})
+    assert warn_of_skew(found, ["b"]) == []
+    assert warn_of_skew(found, ["a", "b"])[0].endswith("profile (--profile a) shows it")

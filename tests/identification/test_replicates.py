@@ -10,11 +10,11 @@ from helpers import least_squares
 
 from torchcloth import recordings as rec
 from torchcloth.identification.estimators import levenberg_marquardt
-from torchcloth.identification.estimators.levenberg_marquardt import WINDOW, at_least, covariance, minimise, student
-from torchcloth.identification.estimators.linearity import Checked
+from torchcloth.identification.estimators.levenberg_marquardt import DEFAULT_NOISE_MODEL, inflate_covariance, covariance, minimise, student_quantile
+from torchcloth.identification.estimators.linearity import LinearityCheck
 from torchcloth.identification.uncertainty import replicates
-from torchcloth.identification.uncertainty.consider_covariance import covariance_of
-from torchcloth.identification.uncertainty.replicates import strata_of
+from torchcloth.identification.uncertainty.consider_covariance import solution_covariance
+from torchcloth.identification.uncertainty.replicates import assign_strata
 
 HIDDEN = 0.05  # standard deviation of what differs between episodes, in units of the unknowns
 FRAMES = 12
@@ -34,7 +34,7 @@ def repeats(seed, count, motions=1, hidden=HIDDEN, offset=0.0):
             number, (t, where) = len(jacobian), least_squares.layout(FRAMES)
             jacobian.append(own)
             data.append(own @ value + 0.1 * least_squares.noise(generator, 0.0, FRAMES))
-            frame.append(t + number * (FRAMES + WINDOW + 1))
+            frame.append(t + number * (FRAMES + DEFAULT_NOISE_MODEL.frames_per_time_block + 1))
             patch.append(where)
             episode.append(torch.full_like(t, number))
     J = torch.cat(jacobian)
@@ -48,7 +48,7 @@ def found(seed, count, motions=1, strata=None, scatter=True, **options):
     matrix = covariance(toy.problem(), at)
     if scatter:
         strata = torch.zeros(count * motions, dtype=torch.int64) if strata is None else strata
-        matrix = at_least(matrix, replicates.scatter(toy.problem(), at, episode, strata))
+        matrix = inflate_covariance(matrix, replicates.jackknife_variance(toy.problem(), at, episode, strata))
     return at.raw - least_squares.TRUE, matrix.diagonal().sqrt()
 
 
@@ -71,7 +71,7 @@ def test_errors_are_those_of_a_mean_of_episodes():
     assert float(stds.square().mean().sqrt()) == pytest.approx(wanted, rel=0.12)
 
 
-def test_leaving_out_an_episode_moves_the_estimate_as_a_fit_without_it_does():
+def test_leaving_out_an_episode_moves_the_estimate_as_a_fit_shift_without_it_does():
     """Episodes that differ much: what was an outlier among all is none without the one that made the others small."""
     toy, episode = repeats(1, 3, hidden=0.5)
     whole = minimise(toy.problem(), least_squares.TRUE.clone(), 20, lambda _: False)
@@ -80,16 +80,16 @@ def test_leaving_out_an_episode_moves_the_estimate_as_a_fit_without_it_does():
         J = torch.func.jacfwd(toy.model)(least_squares.TRUE)[kept]
         alone = least_squares.Toy(lambda raw, J=J: J @ raw, toy.data[kept], toy.frame[kept], toy.patch[kept], prior_std=1e3)
         wanted = minimise(alone.problem(), least_squares.TRUE.clone(), 20, lambda _: False).raw - whole.raw
-        moved = replicates._without(toy.problem(), whole, ~kept)
+        moved = replicates._shift_without(toy.problem(), whole, ~kept)
         assert float((moved - wanted).norm()) < 0.1 * float(wanted.norm())
 
 
-def test_episodes_without_data_of_a_kind_do_not_scatter():
+def test_episodes_shift_without_data_of_a_kind_do_not_scatter():
     """One of three alone has readings: without it there is no fit, and the others move nothing."""
     toy, episode = repeats(1, 3)
     at = minimise(toy.problem(), least_squares.TRUE.clone(), 20, lambda _: False)
     alone = torch.zeros_like(episode)
-    assert torch.equal(replicates.scatter(toy.problem(), at, alone, torch.zeros(3).long()), torch.zeros_like(at.raw))
+    assert torch.equal(replicates.jackknife_variance(toy.problem(), at, alone, torch.zeros(3).long()), torch.zeros_like(at.raw))
 
 
 def test_only_replicates_scatter():
@@ -105,7 +105,7 @@ def test_only_replicates_scatter():
 
 @pytest.mark.parametrize("freedom", [2, 3, 4, 9, 50])
 def test_students_quantile(freedom):
-    assert student(freedom) == pytest.approx(scipy.stats.t.ppf(0.975, freedom), rel=0.035)
+    assert student_quantile(freedom) == pytest.approx(scipy.stats.t.ppf(0.975, freedom), rel=0.035)
 
 
 def named(name, **split):
@@ -126,7 +126,7 @@ def named(name, **split):
     ],
 )
 def test_episodes_repeat_each_other_when_they_say_so(episodes, strata):
-    assert strata_of(episodes).tolist() == strata
+    assert assign_strata(episodes).tolist() == strata
 
 
 def test_folders_of_one_name_are_other_episodes():
@@ -135,9 +135,9 @@ def test_folders_of_one_name_are_other_episodes():
     def at(path, **split):
         return SimpleNamespace(path=Path(path), split=split)
 
-    assert strata_of([at(f"day{k}/ep") for k in range(3)]).tolist() == [0, 0, 0]
+    assert assign_strata([at(f"day{k}/ep") for k in range(3)]).tolist() == [0, 0, 0]
     repeated = [at(f"day{k}/{name}", **said) for k in range(2) for name, said in REPEATED]
-    assert strata_of(repeated).tolist() == [1, 1, 1, 2, 2, 2]
+    assert assign_strata(repeated).tolist() == [1, 1, 1, 2, 2, 2]
 
 
 REPEATED = (("ep", {}), ("again", {"replicate_of": "ep"}), ("third", {"replicate_of": "again"}))
@@ -155,7 +155,7 @@ def test_nuisances_of_an_episode_do_not_scatter():
         jacobian[..., 1 + e] = -(torch.rand(frames, points) > 0.5).double()
         slopes.append(jacobian.reshape(-1, 1 + episodes))
         t, where = torch.meshgrid(torch.arange(frames), torch.arange(points), indexing="ij")
-        frame.append(t.reshape(-1) + e * (frames + WINDOW))
+        frame.append(t.reshape(-1) + e * (frames + DEFAULT_NOISE_MODEL.frames_per_time_block))
         patch.append(where.reshape(-1))
         own.append(torch.full((frames * points,), e))
     J, frame, patch, own = map(torch.cat, (slopes, frame, patch, own))
@@ -176,14 +176,14 @@ def test_nuisances_of_an_episode_do_not_scatter():
     at = minimise(problem, torch.zeros(1 + episodes), 30, lambda _: False)
     objective = SimpleNamespace(
         problem=lambda: problem,
-        episodes=[SimpleNamespace(settles=False)] * episodes,
-        episode_of=lambda linear: own,
+        episodes=[SimpleNamespace(needs_settling=False)] * episodes,
+        episode_of_rows=lambda linear: own,
         unknowns=[None],
         start=torch.zeros(1 + episodes),
         nuisances=[],
         cloth=SimpleNamespace(boundaries={}),
     )
-    found = covariance_of(objective, Checked(at, None, [], [])).diagonal().sqrt()
+    found = solution_covariance(objective, LinearityCheck(at, None, [], [])).diagonal().sqrt()
     alone = covariance(problem, at).diagonal().sqrt()
     assert found[1:] == pytest.approx(alone[1:])
     assert float(found[0]) > float(alone[0])

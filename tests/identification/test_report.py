@@ -10,14 +10,20 @@ from helpers.twins import at
 
 import torchcloth as tc
 from torchcloth.episodes.observed import Episode
-from torchcloth.episodes.unknowns import collect, with_priors
+from torchcloth.episodes.unknowns import collect_unknowns, apply_priors
 from torchcloth.identification.estimators import levenberg_marquardt, linearity
-from torchcloth.identification.nuisances import Placed
-from torchcloth.identification.residuals.metrics import Figures
+from torchcloth.identification.nuisances import NuisanceSlice
+from torchcloth.identification.residuals.metrics import DistanceMetrics
 from torchcloth.identification.residuals.rigid_carry import CARRIED
 from torchcloth.identification.result import Identification
 from torchcloth.identification.uncertainty.estimates import Estimate
-from torchcloth.identification.uncertainty.reporting import Found, estimates, nuisance_estimates, warnings_of, withdraw
+from torchcloth.identification.fit_warnings import fit_warnings
+from torchcloth.identification.uncertainty.estimates import (
+    EstimateSet,
+    make_estimates,
+    make_nuisance_estimates,
+    withdraw_estimates,
+)
 
 GOOD = Estimate(2.0, 0.1, (1.8, 2.2), "-", 1.0, True)
 LOST = Estimate(2.0, 1.9, (0.1, 9.0), "-", 1.0, False)
@@ -31,14 +37,14 @@ def found(a=GOOD, b=GOOD, correlation=0.0, density=True):
         parameters["areal_density"] = Estimate(0.3, 0.005, (0.29, 0.31), "kg/m^2", 0.3, True, "prior")
     matrix = {m: {n: float(m == n) for n in parameters} for m in parameters}
     matrix["a"]["b"] = matrix["b"]["a"] = correlation
-    return Found(parameters, matrix)
+    return EstimateSet(parameters, matrix)
 
 
 def warn(model, what=None, fit=None, episodes=(EPISODE,), frames=None, null=""):
     flat = torch.as_tensor(model.mesh.vertices).expand(2, -1, -1)
     faces = torch.as_tensor(model.mesh.faces)
     frames = [flat] if frames is None else frames
-    return warnings_of(model, episodes, what or found(), {**FIT, **(fit or {})}, frames, faces, null)
+    return fit_warnings(model, episodes, what or found(), {**FIT, **(fit or {})}, frames, faces, null)
 
 
 def folded(model):
@@ -60,11 +66,11 @@ def test_a_good_fit_has_no_warnings(model):
         ({"null": CARRIED}, "no better than cloth carried rigidly"),
         ({"fit": {"chamfer_before": 0.7e-3}}, "farther from the points than the start"),
         ({"what": found(a=LOST)}, "a is not identifiable from these data"),
-        ({"what": found(correlation=-0.97)}, "b and a can hardly be told apart (correlation -0.97)"),
+        ({"what": found(correlation=-0.97)}, "b and a are confounded (correlation -0.97)"),
         ({"what": found(density=False)}, "areal density was taken as exact"),
         ({"fit": {"rms_after": 2.1e-3}}, "the residual (2.1 mm rms) exceeds 1.3 times the sensor noise (1.0 mm)"),
-        ({"episodes": (EPISODE, replace(EPISODE, settles=False))}, "an episode has no initial_vertices"),
-        ({"episodes": (replace(EPISODE, dropped=3),)}, "shake: 3 of 12 frames come after the motion's end"),
+        ({"episodes": (EPISODE, replace(EPISODE, needs_settling=False))}, "an episode has no initial_vertices"),
+        ({"episodes": (replace(EPISODE, frames_after_motion=3),)}, "shake: 3 of 12 frames come after the motion's end"),
     ],
 )
 def test_every_warning_comes_alone_with_its_reason(model, change, said):
@@ -80,7 +86,7 @@ def test_layers_that_meet_are_noticed_where_contact_was_left_out(model, recordin
 
 
 def test_unknown_noise_is_not_compared(model):
-    assert warn(model, fit={"rms_after": 1.0}, episodes=(replace(EPISODE, noise=None),)) == []
+    assert warn(model, fit={"rms_after": 1.0}, episodes=(replace(EPISODE, noise_std=None),)) == []
 
 
 def test_what_was_measured_or_absent_is_not_called_unidentifiable(model):
@@ -102,10 +108,10 @@ def test_an_unstable_motion_is_said_and_differences_replace_tangents():
         def problem(self):
             one = torch.ones(1)
             return levenberg_marquardt.Problem(
-                None, None, None, prior_mean=0 * one, prior_std=one, longest=one, noise=1e-3
+                None, None, None, prior_mean=0 * one, prior_std=one, max_step=one, noise_floor=1e-3
             )
 
-        def secants(self, raw, steps):
+        def linearise_by_differences(self, raw, steps):
             assert 0.005 <= float(steps[0]) <= 0.1
             return linear(self.secant), None
 
@@ -120,26 +126,26 @@ def test_an_unstable_motion_is_said_and_differences_replace_tangents():
     at_start = at_slope(1.0)
     for secant, warned, bent in ((1.2, False, []), (1.4, False, ["youngs_modulus"]), (5.0, True, [])):
         fake = made("youngs_modulus", secant)
-        checked = linearity.check(fake, at_start)
-        assert bool(checked.warnings) == checked.withdrawn == warned
-        assert checked.curved == bent
+        checked = linearity.check_linearity(fake, at_start)
+        assert bool(checked.warnings) == checked.is_withdrawn == warned
+        assert checked.curved_parameters == bent
         assert (checked.final.linear is not at_start.linear) == warned
     assert "tangents of youngs_modulus miss finite steps by up to 80 %" in checked.warnings[0]
     away = at_start._replace(linear=linear(1e4))
-    assert linearity.runaway(fake, away)
-    assert not linearity.runaway(fake, at_start)
+    assert linearity.has_runaway_tangents(fake, away)
+    assert not linearity.has_runaway_tangents(fake, at_start)
     for slope, warned in ((1e-3, False), (1.0, True)):  # what no reading notices misleads none; runaway tangents do
         fake = made("density", 5e-3)
-        assert bool(linearity.check(fake, at_slope(slope)).warnings) == warned
+        assert bool(linearity.check_linearity(fake, at_slope(slope)).warnings) == warned
 
 
 # -- estimates -------------------------------------------------------------------------------------------------------
 
 
 def stated(model, deviation, names=("youngs_modulus", "air.normal")):
-    unknowns = collect(model, names, None)
+    unknowns = collect_unknowns(model, names, None)
     raw = torch.tensor([u.start for u in unknowns])
-    return estimates(model, unknowns, raw, torch.diag(torch.tensor(deviation) ** 2)).parameters
+    return make_estimates(model, unknowns, raw, torch.diag(torch.tensor(deviation) ** 2)).parameters
 
 
 def test_errors_of_logarithms_become_errors_of_values(model):
@@ -160,7 +166,7 @@ def test_a_default_prior_is_no_knowledge(recording):
     assert not stated(model, [1.0], ["poisson_ratio"])["poisson_ratio"].identifiable
     assert stated(model, [0.3], ["poisson_ratio"])["poisson_ratio"].identifiable
     stiff = at(recording, **{"bending.stiffness": 1e-3})
-    wide = collect(stiff, ["bending.stiffness"], None)[0].prior_std
+    wide = collect_unknowns(stiff, ["bending.stiffness"], None)[0].prior_std
     assert not stated(stiff, [wide], ["bending.stiffness"])["bending.stiffness"].identifiable
 
 
@@ -174,13 +180,13 @@ def test_an_amplitude_of_zero_can_be_known(recording):
 
 def test_what_is_withdrawn_is_not_identified_by_its_prior_either(model):
     """The fit took it to elsewhere, with the error of slopes that mean nothing: its prior's is what is known."""
-    unknowns = with_priors(
-        collect(model, ["youngs_modulus", "poisson_ratio"], (0.3, 0.005)), {"youngs_modulus": (1e6, 1.01)}
+    unknowns = apply_priors(
+        collect_unknowns(model, ["youngs_modulus", "poisson_ratio"], (0.3, 0.005)), {"youngs_modulus": (1e6, 1.01)}
     )
     raw = torch.tensor([u.start for u in unknowns])
-    fitted = estimates(model, unknowns, raw, torch.diag(torch.full((3,), 1e-12)))
+    fitted = make_estimates(model, unknowns, raw, torch.diag(torch.full((3,), 1e-12)))
     assert fitted.parameters["youngs_modulus"].source == fitted.parameters["areal_density"].source == "prior"
-    p = withdraw(fitted, unknowns, raw).parameters
+    p = withdraw_estimates(fitted, unknowns, raw).parameters
     assert not any(e.identifiable for e in p.values())
     assert p["youngs_modulus"].std == pytest.approx(8e4 * math.hypot(math.log(1.01), math.log(12.5)))
     assert p["youngs_modulus"].ci95 == pytest.approx((8e4, 1.0197e6), rel=1e-3)
@@ -189,11 +195,11 @@ def test_what_is_withdrawn_is_not_identified_by_its_prior_either(model):
 
 def test_nuisances_of_what_is_withdrawn_are_not_known_either():
     """Their tiny errors are those of slopes that mean nothing, as the parameters' are."""
-    episode, clock = SimpleNamespace(name="swing"), Placed(None, slice(0, 1), ["clock"], ["s"], [0.02])
+    episode, clock = SimpleNamespace(name="swing"), NuisanceSlice(None, slice(0, 1), ["clock"], ["s"], [0.02])
     raw, covariance = torch.tensor([0.012]), torch.tensor([[3e-4**2]])
-    found = nuisance_estimates([episode], [[clock]], raw, covariance)["swing"]["clock"]
+    found = make_nuisance_estimates([episode], [[clock]], raw, covariance)["swing"]["clock"]
     assert (found.identifiable, found.std) == (True, pytest.approx(3e-4))
-    found = nuisance_estimates([episode], [[clock]], raw, covariance, withdrawn=True)["swing"]["clock"]
+    found = make_nuisance_estimates([episode], [[clock]], raw, covariance, withdrawn=True)["swing"]["clock"]
     assert not found.identifiable
     assert found.std == pytest.approx(math.hypot(0.02, 0.012))
     assert found.ci95 == pytest.approx((-0.0392, 0.0392), rel=1e-3)
@@ -201,10 +207,10 @@ def test_nuisances_of_what_is_withdrawn_are_not_known_either():
 
 def test_what_is_withdrawn_far_from_its_start_is_uncertain_by_the_way(model):
     """Predictions read std over value as the error of a logarithm."""
-    unknowns = collect(model, ["youngs_modulus"], None)
+    unknowns = collect_unknowns(model, ["youngs_modulus"], None)
     for factor in (1e-3, 1e3):
         raw = torch.tensor([unknowns[0].start + math.log(factor)])
-        e = withdraw(estimates(model, unknowns, raw, torch.eye(1)), unknowns, raw).parameters["youngs_modulus"]
+        e = withdraw_estimates(make_estimates(model, unknowns, raw, torch.eye(1)), unknowns, raw).parameters["youngs_modulus"]
         assert e.std / e.value == pytest.approx(math.hypot(math.log(10), math.log(factor)))
 
 
@@ -212,11 +218,11 @@ def test_friction_is_judged_against_a_friction_s_size():
     mesh = tc.meshes.rectangle(0.2, 0.2, triangles=18)
     table = {"table": tc.boundaries.Plane(friction=0.1)}
     cloth = tc.Cloth(mesh, tc.materials.AEP(1e5, 0.3), 0.2, {"gravity": tc.effects.Gravity()}, table, tc.Contact(0.05))
-    unknowns = collect(cloth, ["table.friction", "cone"], None)
-    found = estimates(cloth, unknowns, torch.tensor([0.05, 0.05]), torch.eye(2) * 0.2**2).parameters
+    unknowns = collect_unknowns(cloth, ["table.friction", "cone"], None)
+    found = make_estimates(cloth, unknowns, torch.tensor([0.05, 0.05]), torch.eye(2) * 0.2**2).parameters
     assert not found["table.friction"].identifiable
     assert not found["cone"].identifiable
-    known = estimates(cloth, unknowns, torch.tensor([0.05, 0.05]), torch.eye(2) * 0.05**2).parameters
+    known = make_estimates(cloth, unknowns, torch.tensor([0.05, 0.05]), torch.eye(2) * 0.05**2).parameters
     assert known["cone"].identifiable
 
 
@@ -249,5 +255,5 @@ def test_what_is_not_json_is_not_written(tmp_path):
 
 def test_figures_of_a_fit_name_what_they_count():
     """``fit`` is one flat object of numbers."""
-    assert set(Figures._fields) == {"chamfer", "rms", "per_frame"}
+    assert set(DistanceMetrics._fields) == {"chamfer", "rms", "per_frame"}
     assert all(isinstance(value, float) for value in outcome().as_dict()["fit"].values())

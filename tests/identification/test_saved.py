@@ -12,14 +12,14 @@ from torchcloth import recordings
 from torchcloth.dynamics.contact import Contact
 from torchcloth.effects import AirDrag, Gravity
 from torchcloth.errors import InvalidInput, RecordingError, UnstableStep
-from torchcloth.identification import build_cloth, fitted, identify, predict_episode, replayed
-from torchcloth.identification.io.saved_fit import read_saved
-from torchcloth.identification.io.unrecorded_settings import beyond
+from torchcloth.identification import build_cloth, load_fitted_cloth, identify, predict_episode, replay_fit
+from torchcloth.identification.io.saved_fit import read_saved_fit
+from torchcloth.identification.io.unrecorded_settings import find_unrecorded_settings
 
 
 def test_the_frames_of_the_fit_come_back(pair, recording, tmp_path):
     pair.save(tmp_path)
-    again = replayed(tmp_path, recording)
+    again = replay_fit(tmp_path, recording)
     torch.testing.assert_close(again.frames, pair.frames_after[0], rtol=0, atol=1e-9)
     assert float(again.chamfer.mean()) == pytest.approx(pair.fit["chamfer_after"], rel=1e-6)
     assert again.warning == ""
@@ -28,7 +28,7 @@ def test_the_frames_of_the_fit_come_back(pair, recording, tmp_path):
 def test_start_values_that_were_not_fitted_are_kept(pair, tmp_path):
     """`pair` fits stiffness and air; the rest is the data sheet's."""
     pair.save(tmp_path)
-    values = read_saved(tmp_path / "identification.json").values
+    values = read_saved_fit(tmp_path / "identification.json").values
     assert values["poisson_ratio"] == pytest.approx(twins.NOMINAL.poisson)
     assert values["bending.damping_time"] == pytest.approx(twins.NOMINAL.damping_time)
     assert values["youngs_modulus"] == pair.parameters["youngs_modulus"].value != pytest.approx(2e4)
@@ -36,12 +36,12 @@ def test_start_values_that_were_not_fitted_are_kept(pair, tmp_path):
 
 def test_what_the_data_left_open_is_uncertain_and_not_exact(pair, recording, tmp_path):
     path = pair.save(tmp_path)
-    _, known = fitted(path, recording)
+    _, known = load_fitted_cloth(path, recording)
     assert known.keys() == pair.keys.keys()
     content = json.loads(path.read_text())
     content["parameters"]["youngs_modulus"] |= {"identifiable": False, "std": 2.3 * known["youngs_modulus"][0]}
     path.write_text(json.dumps(content))
-    _, unknown = fitted(path, recording)
+    _, unknown = load_fitted_cloth(path, recording)
     assert unknown["youngs_modulus"] == pytest.approx((known["youngs_modulus"][0], 10.0), rel=0.01)
     assert unknown["air.normal"] == known["air.normal"]
 
@@ -49,19 +49,19 @@ def test_what_the_data_left_open_is_uncertain_and_not_exact(pair, recording, tmp
 def test_points_may_have_been_rounded_on_disk(pair, recording, tmp_path):
     """Fitted in memory, viewed from a folder whose points are in tenths of a millimetre."""
     path = recordings.write(recording, tmp_path / "episode")
-    again = replayed(pair.save(tmp_path), recordings.read(path))
+    again = replay_fit(pair.save(tmp_path), recordings.read(path))
     assert np.allclose(again.frames, pair.frames_after[0], atol=1e-6)
-    assert again.fitted
+    assert again.was_fitted
     assert again.warning == ""
     assert float(again.chamfer.mean()) == pytest.approx(pair.fit["chamfer_after"], abs=1e-5)
 
 
 def test_contact_and_step_are_kept(brief, tmp_path):
     """As they were given: the simulation with other ones would be another."""
-    cloth = build_cloth(brief, contact=Contact(0.05, damping=0.2, play=0.1))
+    cloth = build_cloth(brief, contact=Contact(0.05, damping=0.2, free_compression=0.1))
     fit = identify(cloth, brief, ["youngs_modulus"], iterations=1, dt=1e-4)
-    again = replayed(fit.save(tmp_path), brief)
-    assert again.cloth.contact == Contact(0.05, damping=0.2, play=0.1)
+    again = replay_fit(fit.save(tmp_path), brief)
+    assert again.cloth.contact == Contact(0.05, damping=0.2, free_compression=0.1)
     torch.testing.assert_close(again.frames, fit.frames_after[0], rtol=0, atol=1e-9)
     assert json.loads((tmp_path / "identification.json").read_text())["model"]["dt"] == 1e-4
 
@@ -71,23 +71,31 @@ def test_another_thickness_is_another_fabric(pair, recording, tmp_path):
     path = pair.save(tmp_path)
     thick = replace(recording, cloth=replace(recording.cloth, thickness=2e-3))
     with pytest.raises(InvalidInput, match=r"another thickness; got 0.002 m in the episode, 0.001 m in the fit"):
-        replayed(path, thick)
+        replay_fit(path, thick)
+
+
+@pytest.mark.parametrize(
+    ("schema", "said"), [(None, "got none"), ("torchcloth.identification/0", "got 'torchcloth.identification/0'")]
+)
+def test_a_file_of_another_schema_is_refused(pair, recording, tmp_path, schema, said):
+    path = pair.save(tmp_path)
     content = json.loads(path.read_text())
-    del content["model"]["thickness"]
-    path.write_text(json.dumps(content))
-    assert replayed(path, recording).warning == ""  # a file of before
+    del content["schema"]
+    path.write_text(json.dumps(content if schema is None else {"schema": schema, **content}))
+    with pytest.raises(RecordingError, match=f"schema; {said}; expected 'torchcloth.identification/1'"):
+        replay_fit(path, recording)
 
 
 def test_the_right_one_of_several_episodes_is_found(recording, brief, tmp_path):
     fit = identify(twins.at(brief), [brief, recording], ["youngs_modulus"], iterations=1)
     fit.save(tmp_path)
     for number, one in enumerate((brief, recording)):
-        again = replayed(tmp_path, one)
+        again = replay_fit(tmp_path, one)
         torch.testing.assert_close(again.frames, fit.frames_after[number], rtol=0, atol=1e-9)
         assert again.warning == ""
-        assert again.fitted
-    again = replayed(tmp_path, twins.first(recording, 5))
-    assert not again.fitted
+        assert again.was_fitted
+    again = replay_fit(tmp_path, twins.first(recording, 5))
+    assert not again.was_fitted
     assert again.warning == ""
 
 
@@ -107,20 +115,20 @@ def test_what_no_episode_describes_is_not_left_out_silently(brief, tmp_path, key
     cloth = twins.at(brief)
     cloth.effects[key] = part(cloth)
     identify(cloth, brief, ["youngs_modulus"], iterations=1).save(tmp_path)
-    for read in (fitted, predict_episode, replayed):
+    for read in (load_fitted_cloth, predict_episode, replay_fit):
         with pytest.raises(InvalidInput, match=f"a fit of another model; got {said} not alike in both"):
             read(tmp_path, brief)
 
 
 def test_precision_and_mesh_are_no_other_model(brief):
-    assert beyond(twins.at(brief).double(), brief) == []
-    assert beyond(build_cloth(brief, contact=Contact(0.05)), brief) == []
+    assert find_unrecorded_settings(twins.at(brief).double(), brief) == []
+    assert find_unrecorded_settings(build_cloth(brief, contact=Contact(0.05)), brief) == []
     finer = replace(brief, cloth=replace(brief.cloth, vertices=None, faces=None, sheet=(0.3, 0.3)))
-    assert beyond(twins.at(brief), finer) == []
+    assert find_unrecorded_settings(twins.at(brief), finer) == []
     thin = build_cloth(replace(brief, cloth=replace(brief.cloth, thickness=5e-4)))
-    assert beyond(thin, brief) == ["material.thickness"]
+    assert find_unrecorded_settings(thin, brief) == ["material.thickness"]
     nothing = replace(brief, cloth=replace(brief.cloth, vertices=None, faces=None, sheet=None))
-    assert beyond(thin, nothing) == []
+    assert find_unrecorded_settings(thin, nothing) == []
 
 
 @pytest.mark.parametrize("damage", ["a word", None, float("nan"), -1.0])
@@ -130,7 +138,7 @@ def test_a_damaged_error_is_refused_by_all_that_read_it(pair, recording, tmp_pat
     content = json.loads(path.read_text())
     content["parameters"]["youngs_modulus"]["std"] = damage
     path.write_text(json.dumps(content))
-    for read in (fitted, predict_episode, replayed):
+    for read in (load_fitted_cloth, predict_episode, replay_fit):
         with pytest.raises(RecordingError, match="does not say which model was fitted; got"):
             read(path, recording)
 
@@ -144,7 +152,7 @@ def put(*path, value):
     return change
 
 
-CONTACT = {"spacing": 0.05, "subdivisions": None, "damping": 0.1, "play": 0.2, "everywhere": False}
+CONTACT = {"spacing": 0.05, "subdivisions": None, "damping": 0.1, "free_compression": 0.2, "everywhere": False}
 DAMAGE = {
     "deep": (lambda content: "[" * 200_000, "unreadable; got .*recursion"),
     "a number of 400 digits": (put("model", "values", "youngs_modulus", value=10**400), "youngs_modulus 1000.*0000 wh"),
@@ -153,7 +161,7 @@ DAMAGE = {
     "contact spacing a word": (put("model", "contact", value={**CONTACT, "spacing": "x"}), "contact spacing 'x' where"),
     "contact without width": (put("model", "contact", value={**CONTACT, "spacing": 0}), "contact spacing 0 where"),
     "contact of halves": (put("model", "contact", value={**CONTACT, "subdivisions": 2.5}), "subdivisions"),
-    "contact that plays": (put("model", "contact", value={**CONTACT, "play": 2.0}), "contact play; got 2.0"),
+    "contact that plays": (put("model", "contact", value={**CONTACT, "free_compression": 2.0}), "contact free_compression; got 2.0"),
     "contact of nothing": (put("model", "contact", value={"gap": 0.1}), "unexpected keyword argument 'gap'"),
     "no correlation": (put("correlation", value={}), "no fitted parameter in correlation"),
     "no step": (put("model", "dt", value=0), "dt 0 where"),
@@ -171,7 +179,7 @@ def test_damage_is_one_line_that_names_the_file(pair, recording, tmp_path, case)
     path = pair.save(tmp_path)
     content = json.loads(path.read_text())
     path.write_text(change(content) or json.dumps(content))
-    for read in (fitted, predict_episode, replayed):
+    for read in (load_fitted_cloth, predict_episode, replay_fit):
         with pytest.raises(RecordingError, match=said) as caught:
             read(path, recording)
         assert str(caught.value).startswith(f"{path}: ")
@@ -183,7 +191,7 @@ def test_a_step_that_is_too_long_for_an_episode_is_the_files(pair, recording, tm
     content = json.loads(path.read_text())
     content["model"]["dt"] = 0.5
     path.write_text(json.dumps(content))
-    for read in (predict_episode, replayed):
+    for read in (predict_episode, replay_fit):
         with pytest.raises(UnstableStep, match=r"identification.json: dt; got 0.5 s; .*fit again without --dt"):
             read(path, recording)
 
@@ -193,7 +201,7 @@ def test_a_value_that_cannot_be_is_refused_by_name(pair, recording, tmp_path):
     content = json.loads(path.read_text())
     content["model"]["values"]["youngs_modulus"] = -1.0
     path.write_text(json.dumps(content))
-    for read in (fitted, predict_episode, replayed):
+    for read in (load_fitted_cloth, predict_episode, replay_fit):
         with pytest.raises(RecordingError, match=r"identification.json: .*got -1 Pa"):
             read(path, recording)
 
@@ -202,7 +210,7 @@ def test_a_folder_of_models_is_named_as_such(tmp_path):
     with pytest.raises(
         InvalidInput, match=r"no .*identification.json; expected identification.json, or the folder .*it$"
     ):
-        read_saved(tmp_path)
+        read_saved_fit(tmp_path)
     (tmp_path / "extended.tcm").touch()
     with pytest.raises(InvalidInput, match=r"or a model: .*extended\.tcm$"):
-        read_saved(tmp_path)
+        read_saved_fit(tmp_path)

@@ -10,13 +10,13 @@ from helpers import least_squares, twins
 from helpers.least_squares import solve
 
 from torchcloth._utils.resume import ResumableStore
-from torchcloth.episodes.unknowns import collect, with_priors
+from torchcloth.episodes.unknowns import collect_unknowns, apply_priors
 from torchcloth.errors import InvalidInput
 from torchcloth.identification import build_episode, identify
 from torchcloth.identification.estimators import levenberg_marquardt, multistart
-from torchcloth.identification.estimators.gradient_descent import descend
+from torchcloth.identification.estimators.gradient_descent import minimise_by_gradient_descent
 from torchcloth.identification.estimators.objective import Objective
-from torchcloth.identification.nuisances import chosen
+from torchcloth.identification.nuisances import select_nuisances
 
 PAIR = ["youngs_modulus", "air.normal"]
 
@@ -63,17 +63,17 @@ def test_a_distance_is_not_weighed_against_priors(model, brief, method, options,
 def test_descent_steps_by_each_unknowns_own_size(model, brief, adam):
     """A bowl with its bottom at twice the start: bending, of 1e-5 N m, gets as near as stiffness and drag do."""
     names = ["youngs_modulus", "air.normal", "bending.stiffness"]
-    objective = Objective(model, collect(model, names, None), [build_episode(model, brief)], nuisances=chosen([], ["rim"]))
-    bottom = objective.start + 0.5 * objective.sizes
+    objective = Objective(model, collect_unknowns(model, names, None), [build_episode(model, brief)], nuisances=select_nuisances([], ["rim"]))
+    bottom = objective.start + 0.5 * objective.typical_changes
 
     def value_and_slope(question, raw, loss):
-        away = (raw - bottom) / objective.sizes
-        return away.square().sum(), 2 * away / objective.sizes
+        away = (raw - bottom) / objective.typical_changes
+        return away.square().sum(), 2 * away / objective.typical_changes
 
-    objective.value_and_slope = value_and_slope
-    end = descend(objective, objective.start, 40, 0.1, lambda raw, o: False, adam=adam)
-    assert torch.allclose(objective.sizes[:3], torch.tensor([1.0, 1.2, 1e-5], dtype=torch.float64), rtol=0.2)
-    assert float(((end - bottom) / objective.sizes).abs().max()) < 0.1
+    objective.value_and_gradient = value_and_slope
+    end = minimise_by_gradient_descent(objective, objective.start, 40, 0.1, lambda raw, o: False, adam=adam)
+    assert torch.allclose(objective.typical_changes[:3], torch.tensor([1.0, 1.2, 1e-5], dtype=torch.float64), rtol=0.2)
+    assert float(((end - bottom) / objective.typical_changes).abs().max()) < 0.1
 
 
 def test_a_search_that_was_stopped_ends_as_if_it_had_not_been(model, brief, tmp_path, monkeypatch):
@@ -108,9 +108,9 @@ def test_a_search_that_was_stopped_ends_as_if_it_had_not_been(model, brief, tmp_
 
 
 def test_starts_are_spread_over_two_decades(model):
-    unknowns = collect(model, ["youngs_modulus", "poisson_ratio", "air.normal"], (0.3, 0.005))
+    unknowns = collect_unknowns(model, ["youngs_modulus", "poisson_ratio", "air.normal"], (0.3, 0.005))
     begin = torch.tensor([u.start for u in unknowns], dtype=torch.float64)
-    found = torch.stack(multistart.spread(unknowns, begin, 33))
+    found = torch.stack(multistart.sample_starts(unknowns, begin, 33))
     assert torch.equal(found[0], begin)
     decades = (found[:, 0] - begin[0]) / 2.302585
     assert float(decades.min()) < -0.9
@@ -125,9 +125,9 @@ def test_starts_that_agree_are_counted():
     toy, _ = least_squares.linear(0)
     ends = [solve(toy), solve(toy, start=torch.tensor([1.0, -1.0, 0.5], dtype=torch.float64))]
     astray = ends[0]._replace(raw=ends[0].raw + 5.0)
-    astray = levenberg_marquardt.judged(toy.problem(), astray.raw, toy._linearise(astray.raw))
-    reached = multistart.best(toy.problem(), [astray, *ends])
-    assert (reached.agree, reached.tried) == (2, 3)
+    astray = levenberg_marquardt.evaluate_point(toy.problem(), astray.raw, toy._linearise(astray.raw))
+    reached = multistart.select_best(toy.problem(), [astray, *ends])
+    assert (reached.agreeing, reached.simulated) == (2, 3)
     assert float((reached.raw - ends[0].raw).abs().max()) < 1e-2
 
 
@@ -142,11 +142,11 @@ def test_several_starts_are_reported(model, brief):
 
 
 def test_a_prior_of_ones_own(model, brief):
-    unknowns = collect(model, ["youngs_modulus", "poisson_ratio"], None)
-    given = with_priors(unknowns, {"youngs_modulus": (5e4, 1.5), "poisson_ratio": (0.3, 0.02)})
-    assert given[0].value(given[0].middle) == pytest.approx(5e4)
+    unknowns = collect_unknowns(model, ["youngs_modulus", "poisson_ratio"], None)
+    given = apply_priors(unknowns, {"youngs_modulus": (5e4, 1.5), "poisson_ratio": (0.3, 0.02)})
+    assert given[0].value(given[0].prior_mean) == pytest.approx(5e4)
     assert given[0].prior_std == pytest.approx(0.405, abs=1e-3)  # ln 1.5
-    assert given[1].slope(given[1].middle) * given[1].prior_std == pytest.approx(0.02)
+    assert given[1].slope(given[1].prior_mean) * given[1].prior_std == pytest.approx(0.02)
     assert [u.measured for u in given] == [False, True]  # 1.5 times is no measurement, a fifteenth is
     fit = identify(model, brief, ["poisson_ratio"], priors={"poisson_ratio": (0.3, 0.01)}, iterations=2)
     assert fit.parameters["poisson_ratio"].value == pytest.approx(0.3, abs=0.02)
@@ -155,9 +155,9 @@ def test_a_prior_of_ones_own(model, brief):
 
 def test_what_counts_as_large_does_not_depend_on_how_vague_a_prior_is(model):
     """An amplitude is judged against its typical size, and a wider prior is no knowledge."""
-    own = collect(model, ["air.normal"], None)
-    (vague,), (narrow,) = (with_priors(own, {"air.normal": (1.2, std)}) for std in (10.0, 0.5))
-    assert own[0].typical == vague.typical == narrow.typical == pytest.approx(1.2)
+    own = collect_unknowns(model, ["air.normal"], None)
+    (vague,), (narrow,) = (apply_priors(own, {"air.normal": (1.2, std)}) for std in (10.0, 0.5))
+    assert own[0].typical_amplitude == vague.typical_amplitude == narrow.typical_amplitude == pytest.approx(1.2)
     assert (vague.prior_std, narrow.prior_std) == pytest.approx((10.0, 0.5))
 
 
@@ -171,7 +171,7 @@ def test_what_counts_as_large_does_not_depend_on_how_vague_a_prior_is(model):
 )
 def test_wrong_priors_are_named(model, priors, said):
     with pytest.raises(InvalidInput, match=said):
-        with_priors(collect(model, ["youngs_modulus"], None), priors)
+        apply_priors(collect_unknowns(model, ["youngs_modulus"], None), priors)
 
 
 @pytest.mark.parametrize("method", ["adam", "gradient-descent"])

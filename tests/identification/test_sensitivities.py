@@ -4,14 +4,14 @@ import pytest
 import torch
 from helpers.twins import at
 
-from torchcloth.episodes.observed_surface import sheet_of
-from torchcloth.episodes.replay import simulate, tangents
-from torchcloth.episodes.unknowns import collect
+from torchcloth.episodes.observed_surface import build_surface_of_mesh
+from torchcloth.episodes.replay import simulate, simulate_with_tangents
+from torchcloth.episodes.unknowns import collect_unknowns
 from torchcloth.errors import UnstableStep
 from torchcloth.identification import build_episode
 from torchcloth.identification.estimators.objective import Objective
 from torchcloth.identification.residuals.blocks import point_rows
-from torchcloth.identification.residuals.rows import scene_of
+from torchcloth.identification.residuals.rows import match_points
 
 NAMES = ("youngs_modulus", "poisson_ratio", "bending.stiffness", "air.normal")
 EARLY = 0.35  # five frames: 200 ms of the motion, 0.3 s of settling before it
@@ -20,7 +20,7 @@ EARLY = 0.35  # five frames: 200 ms of the motion, 0.3 s of settling before it
 @pytest.fixture
 def short(recording, model):
     """(cloth, unknowns with density, five frames)."""
-    unknowns = collect(model, NAMES, recording.cloth.weighed)
+    unknowns = collect_unknowns(model, NAMES, recording.cloth.measured_areal_density)
     return model, unknowns, build_episode(model, recording).first_fraction(EARLY)
 
 
@@ -35,7 +35,7 @@ def test_tangents_are_central_differences_for_every_unknown(short):
     """
     model, unknowns, seen = short
     dt, raw = 0.5 * model.stable_step(), start(unknowns)
-    frames, tangent = (part.x for part in tangents(model, unknowns, raw, seen, dt))
+    frames, tangent = (part.x for part in simulate_with_tangents(model, unknowns, raw, seen, dt))
     with torch.no_grad():
         torch.testing.assert_close(frames, simulate(model, unknowns, raw, seen, dt).x, rtol=0, atol=1e-12)
         for k, unknown in enumerate(unknowns):
@@ -58,7 +58,7 @@ def test_tangents_equal_reverse_mode(short):
     frames = simulate(model, unknowns, raw, seen).x
     weight = torch.randn(frames.shape, generator=torch.Generator().manual_seed(0), dtype=frames.dtype)
     (reverse,) = torch.autograd.grad((weight * frames).sum(), raw)
-    _, tangent = tangents(model, unknowns, raw.detach(), seen)
+    _, tangent = simulate_with_tangents(model, unknowns, raw.detach(), seen)
     forward = (weight * tangent.x).sum((1, 2, 3))
     torch.testing.assert_close(forward, reverse, rtol=1e-8, atol=1e-12)
 
@@ -82,7 +82,7 @@ def test_tangents_do_not_keep_the_substeps(short, monkeypatch):
         return state, impulses
 
     monkeypatch.setattr(substep, "step", watched)
-    tangents(model, unknowns[:2], start(unknowns[:2]), seen.until(0.0))
+    simulate_with_tangents(model, unknowns[:2], start(unknowns[:2]), seen.until(0.0))
     assert len(alive) > 100
     assert most <= 4  # the present one, its predecessor, the last frame's
 
@@ -95,13 +95,13 @@ def test_jacobian_of_the_rows_with_hits_held(short):
     """
     model, unknowns, seen = short
     raw, dt = start(unknowns), 0.5 * model.stable_step()
-    sheet = sheet_of(model.mesh)
-    frames, tangent = tangents(model, unknowns, raw, seen, dt)
-    part = point_rows(scene_of(frames, tangent, seen, sheet))
+    sheet = build_surface_of_mesh(model.mesh)
+    frames, tangent = simulate_with_tangents(model, unknowns, raw, seen, dt)
+    part = point_rows(match_points(frames, tangent, seen, sheet))
     h = 1e-6
     for k in range(len(unknowns)):
         moves = (frames._replace(x=frames.x + s * h * tangent.x[k]) for s in (1, -1))
-        ahead, behind = (point_rows(scene_of(moved, None, seen, sheet)).value for moved in moves)
+        ahead, behind = (point_rows(match_points(moved, None, seen, sheet)).residual for moved in moves)
         slope = (ahead - behind) / (2 * h)
         error = (slope - part.jacobian[:, k]).abs() / part.jacobian[:, k].abs().max()
         assert float((error < 1e-4).double().mean()) > 0.98  # the others hit an edge between two triangles
@@ -112,14 +112,14 @@ def test_rows_keep_their_order_and_leave_the_first_frame_out(short):
     problem = Objective(model, unknowns, [seen])
     linear = problem.linearise(problem.start)
     value, patch = problem.evaluate(problem.start)
-    off = (value - linear.value).abs()  # m: two kernels, last digits differ, and a point between two triangles may turn
+    off = (value - linear.residual).abs()  # m: two kernels, last digits differ, and a point between two triangles may turn
     assert float(off.max()) < 1e-4
     assert float((off < 1e-9).double().mean()) > 0.98
-    assert float((patch == linear.patch).double().mean()) > 0.98
+    assert float((patch == linear.error_group).double().mean()) > 0.98
     points = linear.block == 0
     counts = [len(cloud) for cloud in seen.clouds]
     assert torch.bincount(linear.frame[points]).tolist() == [0, *counts[1:]]
-    pieces = problem.sheet.rim.count
+    pieces = problem.surface.rim.piece_count
     assert torch.bincount(linear.frame[linear.block == 1]).tolist() == [0, *(pieces for _ in counts[1:])]
     assert linear.jacobian.shape == (sum(counts[1:]) + pieces * (len(counts) - 1), len(unknowns))
 
@@ -129,9 +129,9 @@ def test_secants_of_small_steps_are_tangents(short):
     model, unknowns, seen = short
     problem = Objective(model, unknowns, [seen], 0.5 * model.stable_step())
     steps = 1e-4 * torch.tensor([min(1.0, abs(u.value(u.start))) for u in unknowns])
-    exact, (finite, reach) = problem.linearise(problem.start), problem.secants(problem.start, steps)
+    exact, (finite, reach) = problem.linearise(problem.start), problem.linearise_by_differences(problem.start, steps)
     missed = (exact.jacobian - finite.jacobian).norm(dim=0) / exact.jacobian.norm(dim=0)
-    moved = tangents(model, unknowns, problem.start, seen, 0.5 * model.stable_step())[1].x
+    moved = simulate_with_tangents(model, unknowns, problem.start, seen, 0.5 * model.stable_step())[1].x
     torch.testing.assert_close(reach.position, moved.square().sum(-1).mean((1, 2)).sqrt(), rtol=0.02, atol=1e-9)
     assert float(missed.max()) < 1e-2
 
@@ -141,15 +141,15 @@ def test_where_nothing_can_be_simulated_ahead_secants_go_back(short, monkeypatch
     """A solution just below the stiffness that a given step allows: the search is not lost at its end."""
     model, unknowns, seen = short
     problem = Objective(model, unknowns, [seen], 0.5 * model.stable_step())
-    simulated, steps = problem.seen, 1e-4 * torch.tensor([min(1.0, abs(u.value(u.start))) for u in unknowns])
+    simulated, steps = problem.observe, 1e-4 * torch.tensor([min(1.0, abs(u.value(u.start))) for u in unknowns])
 
     def within(raw):
         if not bool((raw <= problem.start).all()) or (open_to == "neither" and not torch.equal(raw, problem.start)):
             raise UnstableStep("dt", got="0.5 s", expected="less")
         return simulated(raw)
 
-    monkeypatch.setattr(problem, "seen", within)
-    exact, (finite, reach) = problem.linearise(problem.start), problem.secants(problem.start, steps)
+    monkeypatch.setattr(problem, "observe", within)
+    exact, (finite, reach) = problem.linearise(problem.start), problem.linearise_by_differences(problem.start, steps)
     missed = (exact.jacobian - finite.jacobian).norm(dim=0) / exact.jacobian.norm(dim=0)
     assert float(missed.max()) < 1e-2
     assert torch.equal(finite.jacobian, exact.jacobian) is (open_to == "neither")
@@ -159,14 +159,14 @@ def test_where_nothing_can_be_simulated_ahead_secants_go_back(short, monkeypatch
 def test_frames_are_remembered_and_simulations_counted(short):
     model, unknowns, seen = short
     problem = Objective(model, unknowns, [seen, seen])
-    first = problem.seen(problem.start)
+    first = problem.observe(problem.start)
     assert problem.simulations == 2
-    assert problem.seen(problem.start.clone()) is first
+    assert problem.observe(problem.start.clone()) is first
     assert problem.simulations == 2
     problem.linearise(problem.start)
     assert problem.simulations == 2 + 2 * len(unknowns)
     for k in range(5):
-        problem.seen(problem.start + 0.01 * k)
+        problem.observe(problem.start + 0.01 * k)
     assert len(problem._recent) == 4  # frames are large
 
 
@@ -175,8 +175,8 @@ def test_two_episodes_have_frames_of_their_own(short):
     model, unknowns, seen = short
     one, two = Objective(model, unknowns[:1], [seen]), Objective(model, unknowns[:1], [seen, seen])
     a, b = one.linearise(one.start), two.linearise(two.start)
-    half = len(a.value)
-    torch.testing.assert_close(b.value, a.value.repeat(2))
+    half = len(a.residual)
+    torch.testing.assert_close(b.residual, a.residual.repeat(2))
     assert int(b.frame[half:].min()) - int(b.frame[:half].max()) > 5
 
 
@@ -184,6 +184,6 @@ def test_a_zero_amplitude_keeps_its_sensitivity(recording, short):
     """Amplitudes are stored as they are: at zero a logarithm would have none."""
     _, _, seen = short
     model = at(recording, **{"air.normal": 0.0})
-    unknowns = collect(model, ["air.normal"], None)
-    _, tangent = tangents(model, unknowns, torch.zeros(1), seen)
+    unknowns = collect_unknowns(model, ["air.normal"], None)
+    _, tangent = simulate_with_tangents(model, unknowns, torch.zeros(1), seen)
     assert float(tangent.x[0, -1].abs().max()) > 1e-3  # m per unit of the drag coefficient

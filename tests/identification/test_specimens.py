@@ -150,6 +150,6 @@ def test_what_is_refused():
 
 
 def test_no_equilibrium_is_said(monkeypatch):
-    monkeypatch.setattr(specimens, "NEWTON_STEPS", 1)
+    monkeypatch.setattr(specimens, "MAX_NEWTON_STEPS", 1)
     with pytest.raises(SimulationDiverged, match="equilibrium; got none at a strain of"):
         Uniaxial().curve(woven(), table([0.5], 0.5))

@@ -12,7 +12,7 @@ from helpers.off_axis_strips import NAMES, TRUTH, WARP, H, cloth, readings
 
 import torchcloth as tc
 from torchcloth.errors import InvalidInput
-from torchcloth.identification import fit_tension, print_tension, read_model
+from torchcloth.identification import fit_tension, print_tension, read_tension_model
 from torchcloth.recordings import ForceDisplacement
 
 
@@ -142,7 +142,7 @@ def test_a_law_that_stiffens_is_kept_with_its_numbers(tmp_path):
     law = tc.materials.StiffeningAEP(4e7, 0.01, thickness=H)
     sheet = tc.Cloth(mesh, law, 0.1, contact=None)
     fit = fit_tension(sheet, readings(0, 0.01, np.random.default_rng(0)), "youngs_modulus")
-    again = read_model(fit.save(tmp_path))
+    again = read_tension_model(fit.save(tmp_path))
     assert type(again.material) is tc.materials.StiffeningAEP
     assert again.material.youngs_modulus.value.item() == pytest.approx(fit.parameters["youngs_modulus"].value)
 

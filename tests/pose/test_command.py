@@ -8,7 +8,7 @@ from helpers import twins
 
 from torchcloth import recordings
 from torchcloth.cli import main
-from torchcloth.identification import fitted, identify
+from torchcloth.identification import load_fitted_cloth, identify
 
 
 @pytest.fixture(scope="module")
@@ -23,7 +23,7 @@ def test_writes_what_it_found(folder, tmp_path, capsys):
     assert arrays["x"].shape == arrays["std"].shape == (5, 49, 3)
     assert arrays["seen"].shape == (5, 49)
     assert arrays["seen"].dtype == bool
-    assert len(words["shares"]) == len(arrays["windows"]) == len(arrays["acceleration"])
+    assert len(words["force_fractions"]) == len(arrays["windows"]) == len(arrays["acceleration"])
     assert words["parameters"]["youngs_modulus"]["unit"] == "Pa"
     assert (out / "pose.png").stat().st_size > 10_000
     assert sorted(file.name for file in out.iterdir()) == ["pose.json", "pose.npz", "pose.png"]
@@ -37,7 +37,7 @@ def test_takes_a_fit(scene, folder, tmp_path):
     fit = identify(twins.at(short), short, ["youngs_modulus"], iterations=2)
     fit.save(tmp_path)
     other = twins.first(scene.recording, 7)  # not the fitted episode
-    cloth, uncertain = fitted(tmp_path, other)
+    cloth, uncertain = load_fitted_cloth(tmp_path, other)
     found = fit.parameters["youngs_modulus"]
     assert cloth.material.youngs_modulus.value.item() == pytest.approx(found.value)
     assert found.identifiable

@@ -4,9 +4,9 @@ import pytest
 import torch
 
 import torchcloth as tc
-from torchcloth.episodes.streams import on_pattern
+from torchcloth.episodes.streams import locate_on_pattern
 from torchcloth.identification import Episode
-from torchcloth.pose.visibility import rings, seen_vertices
+from torchcloth.pose.visibility import edges_between_points, find_seen_vertices
 
 SIDE, ROWS = 0.3, 7
 
@@ -32,8 +32,8 @@ def test_half_a_sheet(mesh):
     x = torch.as_tensor(mesh.vertices).expand(3, -1, -1)
     away = dense(SIDE) + torch.tensor([0.0, 0.0, 0.1])
     data = episode(mesh, [dense(0.149), torch.zeros(0, 3), away])
-    assert rings(data, mesh) == 1
-    seen = seen_vertices(x, data, mesh)
+    assert edges_between_points(data, mesh) == 1
+    seen = find_seen_vertices(x, data, mesh)
     u = torch.as_tensor(mesh.uv)[:, 0]
     torch.testing.assert_close(seen[0], u < 0.151)
     assert not seen[1].any()  # no points
@@ -45,14 +45,14 @@ def test_few_points_tell_of_their_surroundings(mesh):
     uv = torch.cartesian_prod(*2 * [torch.linspace(0.0375, 0.2625, 4, dtype=torch.float64)])
     cloud = torch.nn.functional.pad(uv, (0, 1))
     data = episode(mesh, [cloud])
-    assert rings(data, mesh) == 2
-    assert seen_vertices(torch.as_tensor(mesh.vertices)[None], data, mesh).all()
+    assert edges_between_points(data, mesh) == 2
+    assert find_seen_vertices(torch.as_tensor(mesh.vertices)[None], data, mesh).all()
 
 
 def test_markers(mesh):
     uv = torch.tensor([[0.01, 0.01], [0.29, 0.29]], dtype=torch.float64)
     markers = torch.tensor([[[0.01, 0.01, 0.0], [torch.nan] * 3]], dtype=torch.float64)
-    data = episode(mesh, [torch.zeros(0, 3)], markers=markers, places=on_pattern(mesh, uv.numpy()))
-    seen = seen_vertices(torch.as_tensor(mesh.vertices)[None], data, mesh)
+    data = episode(mesh, [torch.zeros(0, 3)], markers=markers, places=locate_on_pattern(mesh, uv.numpy()))
+    seen = find_seen_vertices(torch.as_tensor(mesh.vertices)[None], data, mesh)
     assert seen[0].sum() == 3
     assert float(torch.as_tensor(mesh.uv)[seen[0]].max()) < 0.06

@@ -3,7 +3,7 @@
 import torch
 
 from torchcloth.pose import smoothing
-from torchcloth.pose.smoothing import Told, posterior
+from torchcloth.pose.smoothing import DataInformation, compute_posterior
 
 
 def problem(size, rows=30, count=12):
@@ -11,7 +11,7 @@ def problem(size, rows=30, count=12):
     jacobian = size * torch.randn(rows, count, generator=draw, dtype=torch.float64)
     value, offset = torch.randn(rows, generator=draw).double(), torch.randn(count, generator=draw).double()
     q, r = torch.linalg.qr(jacobian)
-    return jacobian, value, offset, Told(r, -(q.mT @ value))
+    return jacobian, value, offset, DataInformation(r, -(q.mT @ value))
 
 
 def test_the_posterior_is_that_of_least_squares(monkeypatch):
@@ -21,8 +21,8 @@ def test_the_posterior_is_that_of_least_squares(monkeypatch):
     information = jacobian.mT @ jacobian + torch.diag(prior_std**-2)
     mean = torch.linalg.solve(information, -jacobian.mT @ value + offset / prior_std**2)
     for steep in (1e99, 0.0):
-        monkeypatch.setattr(smoothing, "STEEP", steep)
-        root, step = posterior(told, prior_std, offset)
+        monkeypatch.setattr(smoothing, "SMOOTHING_SETTINGS", smoothing.SmoothingSettings(max_squared_information=steep))
+        root, step = compute_posterior(told, prior_std, offset)
         torch.testing.assert_close(root @ root.mT, torch.linalg.inv(information), rtol=1e-8, atol=1e-12)
         torch.testing.assert_close(step, mean, rtol=1e-8, atol=1e-12)
 
@@ -32,7 +32,7 @@ def test_slopes_of_an_unstable_motion_leave_a_covariance_and_a_step():
     jacobian, _, offset, told = problem(1e12, rows=5)
     information = jacobian.mT @ jacobian
     assert int(torch.linalg.cholesky_ex(information + torch.eye(12, dtype=torch.float64))[1])
-    root, step = posterior(told, torch.ones(12, dtype=torch.float64), offset)
+    root, step = compute_posterior(told, torch.ones(12, dtype=torch.float64), offset)
     covariance = root @ root.mT
     seen = torch.linalg.qr(jacobian.mT)[0]
     assert float((seen.mT @ covariance @ seen).diagonal().max()) < 1e-3

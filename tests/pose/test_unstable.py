@@ -60,7 +60,7 @@ def test_an_unstable_motion_is_followed_and_said():
     with twins.doubles():
         recording, truth = shaken(26)
         found = estimate_pose(cloth(FIT), recording, modes=8)
-    off, alone = ((x - truth).square().sum(-1).mean().sqrt() for x in (found.x, found.alone))
+    off, alone = ((x - truth).square().sum(-1).mean().sqrt() for x in (found.x, found.uncorrected))
     assert float(off) < 0.75 * float(alone)
     assert not found.fit["converged"]
     assert any("the motion is unstable: from 0." in warning for warning in found.warnings)
