@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 from torchcloth.errors import InvalidInput
-from torchcloth.identification import read_model
+from torchcloth.identification import read_tension_model
 from torchcloth.recordings import ForceDisplacement
 from torchcloth.training.studies.command import main
-from torchcloth.training.studies.measured import SOURCES, find, swing_predictions, swings, tension
+from torchcloth.training.studies.measured import SOURCE_NAMES, find_data_folder, swing_predictions, swings, tension
 from torchcloth.training.validation.realdata import free_swing
 
 
@@ -30,8 +30,8 @@ def test_fast_study(realdata, tmp_path):
     assert "about 0.0 min left" in first.stdout
     assert "min left" not in again.stdout, "nothing is computed twice"
     result = json.loads((out / "measured.json").read_text())
-    names = dict(zip(("nylon", "knits", "swings", "sample"), SOURCES, strict=True))
-    assert set(result) == {name for name, folder in names.items() if (realdata / folder).is_dir()}
+    names = dict(zip(("nylon", "knits", "swings", "sample"), SOURCE_NAMES, strict=True))
+    assert set(result) - {"schema"} == {name for name, folder in names.items() if (realdata / folder).is_dir()}
     if "nylon" in result:
         _check_nylon(result["nylon"], first.stdout, out)
     if "knits" in result:
@@ -51,10 +51,10 @@ def test_fast_study(realdata, tmp_path):
     assert not list(out.glob("progress/*")), "journals last until a fit is kept"
 
 
-def _check_nylon(found, printed, out):
-    inner = [found["left_out"][angle]["measured"]["force"] for angle in ("30", "45")]
-    assert all(one["max"] < 0.15 and one["covered"] > 0.8 for one in inner)
-    assert max(one["measured"]["force"]["max"] for one in found["fitted"].values()) < 0.07
+def _check_nylon(result, printed, out):
+    inner = [result["left_out"][angle]["measured"]["force"] for angle in ("30", "45")]
+    assert all(one["max"] < 0.15 and one["coverage"] > 0.8 for one in inner)
+    assert max(one["measured"]["force"]["max"] for one in result["fitted"].values()) < 0.07
     assert "any other angle: torchcloth predict" in printed
     assert (out / "nylon" / "tension.json").is_file()
     assert (out / "nylon.png").is_file()
@@ -64,10 +64,10 @@ def _check_nylon(found, printed, out):
 def test_runs_are_split_and_thinned(measured_in):
     """Twenty fitted, ten others predicted; the first frame, where the cloth hangs still, is always there."""
     source = measured_in("iri_cloth_swings")
-    fitted, held = swings.split(source, fast=False)
-    assert (len(fitted), len(held)) == (20, 10)
-    assert not set(fitted) & set(held)
-    every, thinned = (swings.recording(source, held[0], n).points for n in (1, 3))
+    fitted, predicted = swings.split(source, fast=False)
+    assert (len(fitted), len(predicted)) == (20, 10)
+    assert not set(fitted) & set(predicted)
+    every, thinned = (swings.recording(source, predicted[0], n).points for n in (1, 3))
     assert len(thinned) == -(-len(every) // 3)
     assert np.array_equal(thinned.frame(0), every.frame(0))
     assert np.array_equal(thinned.frame(2), every.frame(6))
@@ -77,23 +77,23 @@ def test_runs_are_split_and_thinned(measured_in):
 @pytest.mark.realdata
 def test_a_knits_third_pull(measured_in, tmp_path):
     """Near the floor in force; the fit on disk predicts any angle."""
-    found = tension.knit(measured_in("knit_tension"), tmp_path, "Pearlized_Cotton_Seed")
-    for one in found["directions"].values():
+    result = tension.knit(measured_in("knit_tension"), tmp_path, "Pearlized_Cotton_Seed")
+    for one in result["directions"].values():
         force = one["prediction"]["measured"]["force"]
         assert one["floor"]["force"] / 2 < force["rms"] < one["floor"]["force"] + 0.06
-        assert force["covered"] > 0.7
-    assert "poisson_ratio" in read_model(tmp_path).fitted
+        assert force["coverage"] > 0.7
+    assert "poisson_ratio" in read_tension_model(tmp_path).fitted
 
 
 def test_without_data_the_study_says_what_it_needs(tmp_path, monkeypatch, capsys):
     monkeypatch.delenv("TORCHCLOTH_REALDATA", raising=False)
     assert main(["measured", "--out", str(tmp_path / "out")]) == 2
-    said = capsys.readouterr().err
-    assert said.count("\n") == 1
-    assert "--source; got none; expected a folder with some of nylon_offaxis_tension" in said
-    assert "set TORCHCLOTH_REALDATA" in said
+    message = capsys.readouterr().err
+    assert message.count("\n") == 1
+    assert "--source; got none; expected a folder with some of nylon_offaxis_tension" in message
+    assert "set TORCHCLOTH_REALDATA" in message
     with pytest.raises(InvalidInput, match=r"--source; got .*; expected a folder with some of"):
-        find(tmp_path)
+        find_data_folder(tmp_path)
     assert not (tmp_path / "out").exists()
 
 
@@ -109,7 +109,7 @@ def test_the_floor_is_the_third_pulls_distance_from_the_mean_of_the_others():
         lateral_strain=np.tile(-0.1 * u, 3),
         repeat=np.repeat([1, 2, 3], len(u)),
     )
-    floor = tension.floor(table)
+    floor = tension.repeat_floor(table)
     assert floor["force"] == pytest.approx(1.5 * np.sqrt((u**2).mean()) / 3)
     assert floor["lateral"] == pytest.approx(0.0, abs=1e-12)
 
@@ -122,8 +122,8 @@ def test_frequency_and_decay_are_found_with_their_spread():
         q = free_swing.waves(t, 0.9, 30.0, size, 0.02) + 1e-3 * draw.normal(size=len(t))
         rows.append({"swing_t": t.tolist(), "swing_q": q.tolist(), "squares": 4.0, "count": 100, "median": 0.1})
     runs = {str(k): {"measured": row, "null": row, "still": row, "model": row} for k, row in enumerate(rows)}
-    found = swing_predictions.summary(runs, ["model"], draws=5)
-    assert found["measured"]["frequency"] == pytest.approx(0.9, abs=0.005)
-    assert found["measured"]["decay"] == pytest.approx(30.0, rel=0.05)
-    assert 0 < found["model"]["decay_std"] < 3
-    assert found["null"]["rms"] == pytest.approx(0.2)
+    result = swing_predictions.summary(runs, ["model"], draws=5)
+    assert result["measured"]["frequency"] == pytest.approx(0.9, abs=0.005)
+    assert result["measured"]["decay"] == pytest.approx(30.0, rel=0.05)
+    assert 0 < result["model"]["decay_std"] < 3
+    assert result["null"]["rms"] == pytest.approx(0.2)

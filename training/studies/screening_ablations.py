@@ -1,6 +1,6 @@
-"""Fits as they would be screened without one part of the method: functions of a fit, which is left as it is.
+"""Ablations of the screening: functions that return a fit without one part of the method.
 
-Noise is estimated anew where that part changes what is left for it.
+The noise is estimated again if the part changes the residuals.
 """
 
 from __future__ import annotations
@@ -15,63 +15,72 @@ from torchcloth.diagnosis import ModelFit, fit, fit_noise
 from torchcloth.diagnosis.data.binning import BinnedResiduals
 from torchcloth.diagnosis.data.dataset import DiagnosisData
 from torchcloth.diagnosis.inference.fitting import assemble_fit
-from torchcloth.diagnosis.inference.noise import Noise, CovarianceParts
+from torchcloth.diagnosis.inference.noise import CovarianceParts, Noise
 
-NONE = 1e-9  # nearly, of a standard deviation
-SMALL = 1e-2  # of a typical amplitude: a tangent at zero
+NEGLIGIBLE_STD_FACTOR = 1e-9  # removes a standard deviation
+TANGENT_FACTOR = 1e-2  # of a typical amplitude, for slopes at zero
 
 
 class Independent(Noise):
-    """Slow errors are as large as they are, and agree with no neighbour."""
+    """Noise whose slowly varying errors are not correlated."""
 
-    def covariance(self, cells: BinnedResiduals, nuisance: Tensor, std: Tensor, parts: CovarianceParts | None = None) -> Tensor:
-        """Their variances alone, and what differs from episode to episode."""
+    def covariance(
+        self, cells: BinnedResiduals, nuisance: Tensor, std: Tensor, parts: CovarianceParts | None = None
+    ) -> Tensor:
+        """Return the variances of the slow errors as a diagonal, and the nuisances of episodes."""
         moved = nuisance * std
         return torch.diag(super().covariance(cells, nuisance[:, :0], std[:0], parts).diagonal()) + moved @ moved.mT
 
 
-def independent(found: ModelFit) -> ModelFit:
-    """Every cell for itself."""
-    return assemble_fit(found.model, found.linearisation, Independent(*found.noise))
+def without_error_correlation(fitted: ModelFit) -> ModelFit:
+    """Return the fit with uncorrelated errors of the bins."""
+    return assemble_fit(fitted.model, fitted.linearisation, Independent(*fitted.noise))
 
 
-def exact(found: ModelFit) -> ModelFit:
-    """Clock, camera, grasp, rim and tare are as stated in every episode."""
-    evidence = replace(found.linearisation, stds=[NONE * s for s in found.linearisation.nuisance_stds])
-    return assemble_fit(found.model, evidence, fit_noise(evidence))
+def without_nuisances(fitted: ModelFit) -> ModelFit:
+    """Return the fit with exact clock, camera, grasp, boundary and tare in all episodes."""
+    linearisation = replace(
+        fitted.linearisation, nuisance_stds=[NEGLIGIBLE_STD_FACTOR * s for s in fitted.linearisation.nuisance_stds]
+    )
+    return assemble_fit(fitted.model, linearisation, fit_noise(linearisation))
 
 
-def against_zero(found: ModelFit) -> ModelFit:
-    """Any amplitude matters."""
-    anything = [replace(h, smallest_fraction=0.0) for h in found.linearisation.hypotheses]
-    return replace(found, evidence=replace(found.linearisation, hypotheses=anything))
+def with_zero_threshold(fitted: ModelFit) -> ModelFit:
+    """Return the fit with tests against zero instead of the smallest effect of interest."""
+    hypotheses = [replace(h, smallest_fraction=0.0) for h in fitted.linearisation.hypotheses]
+    return replace(fitted, linearisation=replace(fitted.linearisation, hypotheses=hypotheses))
 
 
-def one_mesh(found: ModelFit) -> ModelFit:
-    """Residuals on the given mesh, and nobody knows of another; slopes are those of before."""
-    cells = [c._replace(value=c.value + n) for c, n in zip(found.linearisation.bins, found.linearisation.mesh_differences, strict=True)]
-    evidence = replace(found.linearisation, cells=cells, numerics=[torch.zeros_like(n) for n in found.linearisation.mesh_differences])
-    return assemble_fit(found.model, evidence, fit_noise(evidence))
+def without_mesh_error(fitted: ModelFit) -> ModelFit:
+    """Return the fit on the given mesh, without mesh error; the slopes do not change."""
+    bins = [
+        b._replace(value=b.value + n)
+        for b, n in zip(fitted.linearisation.bins, fitted.linearisation.mesh_differences, strict=True)
+    ]
+    linearisation = replace(
+        fitted.linearisation, bins=bins, mesh_differences=[torch.zeros_like(n) for n in fitted.linearisation.mesh_differences]
+    )
+    return assemble_fit(fitted.model, linearisation, fit_noise(linearisation))
 
 
-def rigid(found: ModelFit) -> ModelFit:
-    """What is fitted stays where it is, however much it could do."""
-    parameters = tuple(replace(p, prior_std=NONE) for p in found.model.parameters)
-    return assemble_fit(replace(found.model, parameters=parameters), found.linearisation, found.noise)
+def with_fixed_parameters(fitted: ModelFit) -> ModelFit:
+    """Return the fit with fixed parameters."""
+    parameters = tuple(replace(p, prior_std=NEGLIGIBLE_STD_FACTOR) for p in fitted.model.parameters)
+    return assemble_fit(replace(fitted.model, parameters=parameters), fitted.linearisation, fitted.noise)
 
 
-def tangents(found: ModelFit, setting: DiagnosisData) -> ModelFit:
-    """Slopes at a hundredth of a typical amplitude, simulated anew."""
-    whole = {h.name: h for h in found.linearisation.hypotheses}
-    small = [replace(h, typical=SMALL * h.typical) for h in whole.values()]
-    near = fit(found.model, setting, small, 0, noise=found.noise, before=found.linearisation)
-    own = [whole[h.name] for h in near.linearisation.hypotheses]
-    return replace(near, evidence=replace(near.linearisation, hypotheses=own))
+def with_tangent_slopes(fitted: ModelFit, setting: DiagnosisData) -> ModelFit:
+    """Return the fit with slopes at a hundredth of the typical amplitudes, simulated again."""
+    by_name = {h.name: h for h in fitted.linearisation.hypotheses}
+    small = [replace(h, typical=TANGENT_FACTOR * h.typical) for h in by_name.values()]
+    near = fit(fitted.model, setting, small, 0, noise=fitted.noise, before=fitted.linearisation)
+    full_hypotheses = [by_name[h.name] for h in near.linearisation.hypotheses]
+    return replace(near, linearisation=replace(near.linearisation, hypotheses=full_hypotheses))
 
 
-WAYS: Mapping[str, Callable[[ModelFit], ModelFit]] = {
-    "slow errors independent": independent,
-    "episodes exact": exact,
-    "tested against zero": against_zero,
-    "on one mesh": one_mesh,
+ABLATIONS: Mapping[str, Callable[[ModelFit], ModelFit]] = {
+    "slow errors independent": without_error_correlation,
+    "episodes exact": without_nuisances,
+    "tested against zero": with_zero_threshold,
+    "on one mesh": without_mesh_error,
 }

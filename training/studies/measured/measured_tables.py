@@ -1,18 +1,18 @@
-"""What the study found, one readable table a source."""
+"""Tables of the study of measured cloth, for each source."""
 
 from __future__ import annotations
 
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from .swings import DENSITY, EFFECTS
-from .tension import LIGHT
+from .swings import NOMINAL_DENSITY_KG_PER_M2, RATIO_UNITS
+from .tension import MAX_ROBOT_FORCE_N
 
 if TYPE_CHECKING:
     from rich.console import Console
     from rich.table import Table
 
-MODELS = {
+MODEL_LABELS = {
     "measured": "measured",
     "still": "nodes before the motion: noise",
     "null": "null: carried rigidly",
@@ -23,8 +23,8 @@ MODELS = {
 }
 
 
-def nylon(found: dict[str, Any], folder: Path) -> None:
-    """Four angles fitted, each predicted from the other three, and angles between."""
+def nylon(result: dict[str, Any], folder: Path) -> None:
+    """Print fits of four angles, predictions of each from the other three, and angles between."""
     console = _console()
     table = _table("Nylon in tension: error of the force, % of the curve's largest reading")
     for heading in (
@@ -37,19 +37,19 @@ def nylon(found: dict[str, Any], folder: Path) -> None:
         "the law's part from",
     ):
         table.add_column(heading, justify="left" if heading.startswith("the") else "right")
-    for angle, fitted in found["fitted"].items():
-        left = found["left_out"][angle]
-        own, other = fitted["measured"]["force"], left["measured"]["force"]
-        numbers = [_percent(own["rms"]), _percent(own["max"]), _percent(other["rms"]), _percent(other["max"])]
-        notes = [left["law_from"].replace("tables at ", "").replace(", each left out of the fit", "")]
+    for angle, fitted in result["fitted"].items():
+        left = result["left_out"][angle]
+        entry, other = fitted["measured"]["force"], left["measured"]["force"]
+        numbers = [_percent(entry["rms"]), _percent(entry["max"]), _percent(other["rms"]), _percent(other["max"])]
+        notes = [left["misfit_source"].replace("tables at ", "").replace(", each left out of the fit", "")]
         notes += ["outside of the fitted angles"] if any("outside" in w for w in left["warnings"]) else []
         notes += [f"{name} not identifiable" for name in left["not_identifiable"]]
-        table.add_row(f"{angle}°", *numbers, f"{100 * other['covered']:.0f} %", "; ".join(notes))
+        table.add_row(f"{angle}°", *numbers, f"{100 * other['coverage']:.0f} %", "; ".join(notes))
     console.print(table)
     table = _table("Nylon at angles that were not measured here: force [N], and the standard deviation's parts")
     for heading in ("angle", "strain", "force", "by parameters", "by the law", "by the preload", "95 % interval"):
         table.add_column(heading, justify="right")
-    for angle, curve in found["between"].items():
+    for angle, curve in result["between"].items():
         for k, r in enumerate(curve):
             parts = [f"± {r[part]:.2f}" for part in ("parameters", "law", "setup")]
             interval = f"{r['low']:.2f} … {r['high']:.2f}"
@@ -59,9 +59,11 @@ def nylon(found: dict[str, Any], folder: Path) -> None:
     console.print(f"any other angle: torchcloth predict {folder} --angle DEGREES", markup=False)
 
 
-def knits(found: dict[str, Any]) -> None:
-    """Third pulls from the first two, beside how far pulls are from each other."""
-    table = _table(f"Knits up to {LIGHT:g} N: third pull from the first two, rms in % of its largest reading")
+def knits(result: dict[str, Any]) -> None:
+    """Print predictions of third pulls from the first two, with the scatter between pulls."""
+    table = _table(
+        f"Knits up to {MAX_ROBOT_FORCE_N:g} N: third pull from the first two, rms in % of its largest reading"
+    )
     for heading in (
         "fabric",
         "along",
@@ -74,14 +76,14 @@ def knits(found: dict[str, Any]) -> None:
         "nu",
     ):
         table.add_column(heading, justify="left" if heading == "fabric" else "right", no_wrap=True)
-    for name, fabric in found.items():
+    for name, fabric in result.items():
         nu = fabric["poisson_ratio"]
         for label, one in fabric["directions"].items():
             judged, floor = one["prediction"]["measured"], one["floor"]
             cells = []
             for kind in ("force", "lateral"):
-                own = judged[kind]
-                cells += [_percent(own["rms"]), _percent(floor[kind]), f"{100 * own['covered']:.0f} %"]
+                entry = judged[kind]
+                cells += [_percent(entry["rms"]), _percent(floor[kind]), f"{100 * entry['coverage']:.0f} %"]
             ratio = f"{nu['value']:.3f} ± {nu['std']:.3f}" if nu["identifiable"] else "not identifiable"
             table.add_row(
                 name.replace("_Yarn", "").replace("_", " ") if label == "X" else "",
@@ -92,31 +94,32 @@ def knits(found: dict[str, Any]) -> None:
     console = _console()
     console.print(table)
     console.print(
-        "repeats differ: third pull from the mean of the first two, which no law that knows these can beat by much. "
-        "in 95 %: share of readings in the interval. nu: symmetric Poisson's ratio"
+        "repeats differ: difference of the third pull from the mean of the first two, the noise floor of any law fitted to "
+        "them. in 95 %: fraction of readings in the interval. nu: symmetric Poisson's ratio"
     )
 
 
-def swings(found: dict[str, Any]) -> None:
-    """Ratios to the areal density, then what they predict."""
+def swings(result: dict[str, Any]) -> None:
+    """Print ratios to the areal density, then the predictions."""
     console = _console()
-    title = f"IRI swings: {len(found['fitted_runs'])} runs fitted. Only ratios to the areal density are identifiable"
+    title = f"IRI swings: {len(result['fitted_runs'])} runs fitted. Only ratios to the areal density are identifiable"
     table = _table(title)
     for heading in ("", "whole runs, by identify", "frequency and decay of the free swings", "unit"):
         table.add_column(heading, justify="left" if heading in ("", "unit") else "right")
-    for name, unit in EFFECTS.items():
-        cells = [_estimate(fit["ratios"].get(name)) for fit in found["fits"].values()]
+    for name, unit in RATIO_UNITS.items():
+        cells = [_estimate(fit["ratios"].get(name)) for fit in result["fits"].values()]
         table.add_row(name, *cells, unit)
     console.print(table)
     console.print(
-        f"C_n, the air's depth and the density itself cannot be told apart (density set to {DENSITY:g} kg/m^2): drag "
-        "is rho C_n / rho_A, added mass rho depth / rho_A. ±: by leaving runs out, and by drawing them again"
+        "C_n, the depth of air and the areal density are confounded (density set to "
+        f"{NOMINAL_DENSITY_KG_PER_M2:g} kg/m^2): drag is rho C_n / rho_A, added mass is rho depth / rho_A. ±: jackknife "
+        "for whole runs, bootstrap for free swings"
     )
-    predicted = found["predicted"]
-    table = _table(f"IRI swings: {len(found['predicted_runs'])} runs predicted; ± by drawing these runs again")
+    predicted = result["predicted"]
+    table = _table(f"IRI swings: {len(result['predicted_runs'])} runs predicted; ± by bootstrap over these runs")
     for heading in ("", "node rms mm", "median mm", "swing Hz", "decay 1/(m s)"):
         table.add_column(heading, justify="right" if heading else "left")
-    for key, label in MODELS.items():
+    for key, label in MODEL_LABELS.items():
         p = predicted[key]
         near = (
             [f"{1e3 * p['rms']:.1f} ± {1e3 * p['rms_std']:.1f}", f"{1e3 * p['median']:.1f}"] if "rms" in p else ["", ""]
@@ -127,18 +130,18 @@ def swings(found: dict[str, Any]) -> None:
     console.print("decay: B of A' = -B A^2, the fall of the amplitude A under quadratic drag")
 
 
-def sample(found: dict[str, Any]) -> None:
-    """Distances of all models in both directions."""
-    console, e = _console(), found["stiffness"]
-    table = _table(f"The paper's sample: {found['points']} points, mean distances in mm")
+def sample(result: dict[str, Any]) -> None:
+    """Print the distances of all models in both directions."""
+    console, e = _console(), result["stiffness"]
+    table = _table(f"The paper's sample: {result['points']} points, mean distances in mm")
     for heading in ("", "cloud to surface", "cloud to vertices", "vertices to cloud"):
         table.add_column(heading, justify="right" if heading else "left")
-    for name, row in found["distances"].items():
+    for name, row in result["distances"].items():
         table.add_row(name, *(f"{1e3 * value:.1f}" for value in row.values()))
     console.print(table)
     stated = f"{e['value']:.0f} ± {e['std']:.0f} N/m" if e["identifiable"] else "not identifiable from these points"
     console.print(f"membrane stiffness E h: {stated} (95 % {e['ci95'][0]:.3g} … {e['ci95'][1]:.3g} N/m)", markup=False)
-    console.print("vertices to cloud: floored by the clouds' 31 points, which leave most of the dress unseen")
+    console.print("vertices to cloud: limited by the clouds' 31 points, which leave most of the dress unseen")
 
 
 def _estimate(e: dict[str, Any] | None) -> str:
