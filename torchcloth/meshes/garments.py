@@ -15,7 +15,7 @@ from .mesh import Mesh
 from .sewing import Curve, Drawing, Kind, Piece, sew
 
 DEFAULT_GARMENT_TRIANGLES = 1500
-LAYER_GAP_M = 0.010  # m
+GARMENT_GAP_M = 0.010  # between front and back
 
 
 def shirt(
@@ -32,9 +32,9 @@ def shirt(
     sleeve_angle: float = 0.6,
     cuff: float = 0.18,
     triangles: int = DEFAULT_GARMENT_TRIANGLES,
-    gap: float = LAYER_GAP_M,
+    gap: float = GARMENT_GAP_M,
 ) -> Mesh:
-    """A T-shirt; with a longer ``sleeve`` a sweatshirt. Openings: neck, hem, left and right cuff.
+    """Build a T-shirt; with a longer ``sleeve`` a sweatshirt. Openings: neck, hem, left and right cuff.
 
     Args:
         length: from the neck's upper edge to the hem [m].
@@ -96,9 +96,9 @@ def trousers(
     hem: float = 0.21,
     spread: float = 0.05,
     triangles: int = DEFAULT_GARMENT_TRIANGLES,
-    gap: float = LAYER_GAP_M,
+    gap: float = GARMENT_GAP_M,
 ) -> Mesh:
-    """Long trousers; with a shorter ``length`` shorts. Openings: waist, left and right hem.
+    """Build long trousers; with a shorter ``length`` shorts. Openings: waist, left and right hem.
 
     Args:
         length: from the waist to the hems [m].
@@ -146,9 +146,9 @@ def dress(
     armhole: float = 0.22,
     waist_height: float = 0.43,
     triangles: int = DEFAULT_GARMENT_TRIANGLES,
-    gap: float = LAYER_GAP_M,
+    gap: float = GARMENT_GAP_M,
 ) -> Mesh:
-    """A sleeveless dress: bodice and flared skirt, sewn at the waist. Openings: neck, hem, left and right armhole.
+    """Build a sleeveless dress of bodice and flared skirt. Openings: neck, hem, left and right armhole.
 
     Args:
         length: from the neck's upper edge to the hem [m].
@@ -202,14 +202,14 @@ def dress(
 
 
 def _check(measures: dict[str, float]) -> None:
-    """Every measure is a finite length; the drawing is checked when it is sewn."""
+    """Check that every measure is a finite length; ``sew`` checks the drawing."""
     for name, value in measures.items():
         if not np.isfinite(value) or (value <= 0 and name not in ("spread", "sleeve_angle", "shoulder_drop", "gap")):
             raise InvalidInput(name, got=f"{value:g}", expected="a positive, finite number")
 
 
 def _curve(kind: Kind, *points: ArrayLike) -> Curve:
-    """Straight through two points; of more, the last three are a quadratic Bezier curve's."""
+    """Build a curve: straight through two points; the last three of more are those of a quadratic Bezier curve."""
     p = np.array(points, dtype=float)
     if len(p) > 2:
         t = np.linspace(0.0, 1.0, 65)[1:-1, None]

@@ -11,25 +11,27 @@ from numpy.typing import ArrayLike
 from ..errors import InvalidInput
 from . import topology
 
-COINCIDENT_VERTEX_FRACTION = 1e-6  # of the largest extent: vertices that near lie in one place
-MAX_EVEN_EDGE_RATIO = 1.5  # times the mean edge, beyond which a longest edge is not that of an even mesh: ours have 1.24 to 1.46
-MAX_PATTERN_EDGE_RATIO, MAX_UNIT_SQUARE_EDGE_RATIO = 1.2, 1.05  # times an edge that lies there, beyond which a pattern's is in another unit
-IGNORED_EDGE_FRACTION = 0.1  # of the edges, that may be longer or shorter: gathered or stretched where the cloth lies
-MAX_CLOTH_SPAN_M = 20.0  # m, of a cloth; the same number in millimetres is a handkerchief
-MAX_AREAL_DENSITY_KG_PER_M2 = 20.0  # kg/m^2, of a cloth; the same number in g/m^2 is a veil
+COINCIDENT_VERTEX_FRACTION = 1e-6  # of the largest extent; nearer vertices lie in the same place
+MAX_EVEN_EDGE_RATIO = 1.5  # longest over mean edge of an even mesh; ours have 1.24 to 1.46
+# Edges in a pattern over those in the mesh; beyond these ratios the pattern is in another unit.
+MAX_PATTERN_EDGE_RATIO = 1.2
+MAX_UNIT_SQUARE_EDGE_RATIO = 1.05  # of a pattern that fills the unit square, and so may be a texture
+IGNORED_EDGE_FRACTION = 0.1  # at each end of these ratios: edges that are gathered or stretched where the cloth lies
+MAX_CLOTH_SPAN_M = 20.0  # a longer cloth is taken to be in millimetres
+MAX_AREAL_DENSITY_KG_PER_M2 = 20.0  # a heavier cloth is taken to be in g/m^2
 
 
 @dataclass(frozen=True, eq=False)
 class Mesh:
-    """A cloth's triangles, where they start, and what shape they would take without force.
+    """Triangles of a cloth, with positions in the world and a rest shape.
 
     Attributes:
-        vertices: [V, 3] m, a world placement of the unstrained cloth.
-        faces: [F, 3] int64, counter-clockwise seen from the side of the normal.
-        rest: [F, 3, 2] m, each triangle's corners in material axes (warp, weft). From the pattern where there is one,
-            a panel drawn from behind turned over; else from the vertices, warp along the triangle's first edge.
+        vertices: [V, 3] m, positions of the unstrained cloth in the world.
+        faces: [F, 3] int64, counter-clockwise as seen from the side of the normal.
+        rest: [F, 3, 2] m, corners of each triangle in material axes (warp, weft). Taken from the pattern if there is
+            one, with panels drawn from behind turned over; else from the vertices, warp along the first edge.
         pattern: [F, 3, 2] m or None, pattern coordinates (u = warp, v = weft) of each triangle's corners. A vertex on
-            a seam belongs to several panels and has a place on each.
+            a seam belongs to several panels and has coordinates on each.
         places: vertex indices by name, such as "left shoulder", for gripping and measuring.
     """
 
@@ -46,7 +48,7 @@ class Mesh:
         uv: ArrayLike | None = None,
         places: Mapping[str, ArrayLike] | None = None,
     ) -> Mesh:
-        """Check the arrays and derive the rest shape.
+        """Check the arrays, and build a mesh with its rest shape.
 
         Args:
             vertices: [V, 3] m.
@@ -75,7 +77,7 @@ class Mesh:
         return Mesh(x, f, rest, pattern, named)
 
     def is_equal(self, other: Mesh) -> bool:
-        """Whether vertices, triangles, rest shapes, patterns and places are the same."""
+        """Return whether vertices, triangles, rest shapes, patterns and places are equal."""
         if self is other:
             return True
         if self.places.keys() != other.places.keys() or (self.pattern is None) is not (other.pattern is None):
@@ -88,61 +90,65 @@ class Mesh:
 
     @property
     def uv(self) -> np.ndarray | None:
-        """[V, 2] m, pattern coordinates of the vertices; None without a pattern, or where a seam gives a vertex two."""
+        """Pattern coordinates of the vertices, [V, 2] m; None without a pattern, or if a seam gives a vertex two."""
         return None if self.pattern is None else corner_to_vertex_values(self.faces, self.pattern)
 
     @property
     def seams(self) -> np.ndarray:
-        """[N, 2] int64, edges along which panels are sewn; empty without a pattern."""
+        """Edges along which panels are sewn, [N, 2] int64; empty without a pattern."""
         return np.zeros((0, 2), np.int64) if self.pattern is None else topology.find_seams(self.faces, self.pattern)
 
     @property
     def boundary_edges(self) -> np.ndarray:
-        """[N, 2] int64, free edges (hems): those of one triangle only."""
+        """Free edges (hems), which belong to one triangle only, [N, 2] int64."""
         edges, triangles = topology.find_edges(self.faces)
         return edges[triangles == 1]
 
     @property
     def panels(self) -> np.ndarray:
-        """[F] int64, the number of each triangle's panel: pieces that were one before sewing; 0 without a pattern."""
+        """Number of each triangle's panel before sewing, [F] int64; 0 without a pattern."""
         return (
-            np.zeros(len(self.faces), np.int64) if self.pattern is None else topology.number_panels(self.faces, self.pattern)
+            np.zeros(len(self.faces), np.int64)
+            if self.pattern is None
+            else topology.number_panels(self.faces, self.pattern)
         )
 
     @property
     def piece_count(self) -> int:
-        """How many parts have no vertex in common."""
+        """Number of pieces that have no vertex in common."""
         return topology.count_pieces(self.faces)
 
     @property
     def duplicated_vertex_count(self) -> int:
-        """How many vertices lie where one of another piece does, as where a file splits them by texture coordinates."""
-        own = topology.number_pieces(self.faces)
-        if own.max(initial=0) == 0:
+        """Number of vertices that lie on a vertex of another piece, as where a file splits them by texture."""
+        piece = topology.number_pieces(self.faces)
+        if piece.max(initial=0) == 0:
             return 0
         used = np.unique(self.faces)
         span = np.ptp(self.vertices, axis=0).max()
         _, place = np.unique(
-            np.round(self.vertices[used] / (COINCIDENT_VERTEX_FRACTION * span)).astype(np.int64), axis=0, return_inverse=True
+            np.round(self.vertices[used] / (COINCIDENT_VERTEX_FRACTION * span)).astype(np.int64),
+            axis=0,
+            return_inverse=True,
         )
         place = place.reshape(-1)
-        pairs = np.unique(np.column_stack([place, own[used]]), axis=0)
+        pairs = np.unique(np.column_stack([place, piece[used]]), axis=0)
         shared = np.bincount(pairs[:, 0]) > 1
         return int(shared[place].sum())
 
     @property
     def area(self) -> np.ndarray:
-        """[F] m^2, rest area of each triangle."""
+        """Rest area of each triangle, [F] m^2."""
         return signed_area(self.rest)
 
     @property
     def vertex_area(self) -> np.ndarray:
-        """[V] m^2, rest: a third of each triangle to each corner, as mass is shared."""
+        """Rest area of each vertex, [V] m^2: a third of each of its triangles, as mass is distributed."""
         return np.bincount(self.faces.ravel(), np.repeat(self.area / 3, 3), minlength=len(self.vertices))
 
     @property
     def shape_gradient(self) -> np.ndarray:
-        """[F, 3, 2] 1/m, gradient of each corner's linear shape function in material axes: F = sum_a x_a (x) G_a."""
+        """Gradients of the corners' linear shape functions in material axes, [F, 3, 2] 1/m: F = sum_a x_a (x) G_a."""
         edges = np.stack([self.rest[:, 1] - self.rest[:, 0], self.rest[:, 2] - self.rest[:, 0]], axis=-1)
         inverse = np.linalg.inv(edges)  # rows: gradients of the 2nd and 3rd shape function
         return np.concatenate([-inverse.sum(1, keepdims=True), inverse], axis=1)
@@ -154,24 +160,24 @@ class Mesh:
 
     @property
     def coarse_edge(self) -> float:
-        """Mean edge length [m], or where triangles differ much 2/3 of the longest edge: what points are laid by."""
+        """Mean edge length [m], or 2/3 of the longest edge where triangles differ much; contact points use it."""
         sides = np.linalg.norm(self.rest - np.roll(self.rest, 1, axis=1), axis=-1)
         return float(max(sides.mean(), sides.max() / MAX_EVEN_EDGE_RATIO))
 
     @property
     def extent(self) -> float:
-        """Longest way [m] along the edges of the rest shape, of any piece from the vertex farthest from its first.
+        """Longest path [m] along the edges of the rest shape, in any piece, from the vertex farthest from its first.
 
-        So far the cloth can extend in any state without strain, up to the zigzag of the edges.
+        The cloth cannot extend farther in any state without strain, up to the zigzag of the edges.
         """
         firsts = topology.find_first_vertices(self.faces)
         starts = (topology.find_farthest_vertex(self.faces, self.rest, int(first))[0] for first in firsts)
         return max(topology.find_farthest_vertex(self.faces, self.rest, start)[1] for start in starts)
 
     def renumber_along_longest_side(self) -> Mesh:
-        """The same cloth with vertices and triangles numbered along its longest side.
+        """Return the same cloth with vertices and triangles numbered along its longest side.
 
-        Threads share a cloth by numbers: where they share few places too, they wait less for each other.
+        Threads divide a cloth by numbers. If neighbours have near numbers, threads wait less for each other.
         """
         along = self.vertices[:, np.ptp(self.vertices, axis=0).argmax()]
         vertices, faces = np.argsort(along, kind="stable"), np.argsort(along[self.faces].sum(1), kind="stable")
@@ -185,7 +191,7 @@ class Mesh:
         )
 
     def vertices_near_pattern_points(self, uv: ArrayLike, radius: float) -> np.ndarray:
-        """Indices of the vertices within ``radius`` [m] of any of the pattern points ``uv`` [G, 2].
+        """Find the vertices within ``radius`` [m] of any of the pattern points ``uv`` [G, 2] m; return their indices.
 
         Raises:
             InvalidInput: the mesh has no pattern coordinates, or no vertex lies that near.
@@ -201,18 +207,18 @@ class Mesh:
             np.column_stack([self.faces.ravel(), self.pattern.reshape(-1, 2)]), axis=0, return_index=True
         )
         distance = np.linalg.norm(corners[:, None, 1:] - np.atleast_2d(uv)[None], axis=-1).min(1)
-        found = np.unique(self.faces.ravel()[owner[distance <= radius * (1 + 1e-9)]])
-        if len(found) == 0:
+        vertices = np.unique(self.faces.ravel()[owner[distance <= radius * (1 + 1e-9)]])
+        if len(vertices) == 0:
             raise InvalidInput(
                 "grasp",
                 got=f"no vertex within {radius:g} m (nearest: {distance.min():.4g} m)",
                 expected="a patch that holds at least one vertex",
                 remedy="enlarge the radius or refine the mesh",
             )
-        return found
+        return vertices
 
     def vertices_at_place(self, place: str, radius: float = 0.0) -> np.ndarray:
-        """Indices of the vertices of a named place, and of those within ``radius`` [m] of it in ``vertices``.
+        """Find the vertices of a named place, and those within ``radius`` [m] of it in space; return their indices.
 
         The radius reaches through layers that lie on each other, as a gripper that pinches them does.
 
@@ -234,16 +240,19 @@ class Mesh:
 
 
 def signed_area(rest: np.ndarray) -> np.ndarray:
-    """[F] m^2 from corners [F, 3, 2]."""
+    """Compute signed areas [F] m^2 of triangles with corners [F, 3, 2] m."""
     a, b = rest[:, 1] - rest[:, 0], rest[:, 2] - rest[:, 0]
     return 0.5 * (a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0])
 
 
 def check_metres(vertices: np.ndarray, faces: np.ndarray, corners: np.ndarray | None, place: str) -> None:
-    """Refuse a file's vertices, or its pattern coordinates [F, 3, 2], that are not in metres.
+    """Check that a file's vertices, and its pattern coordinates [F, 3, 2], are in metres.
 
-    However the cloth lies, folded or sewn, its edges are about as long as in its pattern; those of a texture are not,
-    unless by chance: a pattern that fills the unit square must fit more closely.
+    However the cloth lies, folded or sewn, its edges are about as long as in its pattern. Edges in a texture are not,
+    unless by chance, so a pattern that fills the unit square must agree more closely.
+
+    Raises:
+        InvalidInput: a span beyond MAX_CLOTH_SPAN_M, or a pattern whose edges have other lengths.
     """
     span = float(np.ptp(vertices, axis=0).max())
     if span > MAX_CLOTH_SPAN_M:
@@ -252,7 +261,9 @@ def check_metres(vertices: np.ndarray, faces: np.ndarray, corners: np.ndarray | 
     if corners is None:
         return
     pattern, lying = (np.linalg.norm(c - np.roll(c, 1, axis=1), axis=-1).ravel() for c in (corners, vertices[faces]))
-    low, high = np.quantile(pattern / np.maximum(lying, 1e-9 * span), (IGNORED_EDGE_FRACTION, 1 - IGNORED_EDGE_FRACTION))
+    low, high = np.quantile(
+        pattern / np.maximum(lying, 1e-9 * span), (IGNORED_EDGE_FRACTION, 1 - IGNORED_EDGE_FRACTION)
+    )
     square = np.allclose([corners.min((0, 1)), corners.max((0, 1))], [[0, 0], [1, 1]], rtol=0, atol=1e-3)
     limit = MAX_UNIT_SQUARE_EDGE_RATIO if square else MAX_PATTERN_EDGE_RATIO
     if not 1 / limit < low <= high < limit:
@@ -265,14 +276,14 @@ def check_metres(vertices: np.ndarray, faces: np.ndarray, corners: np.ndarray | 
 
 
 def corner_to_vertex_values(faces: np.ndarray, corners: np.ndarray) -> np.ndarray | None:
-    """[V, D] from the values [F, 3, D] of triangles' corners, or None where a vertex has several."""
+    """Return vertex values [V, D] from corner values [F, 3, D], or None where a vertex has several."""
     values = np.zeros((faces.max() + 1, corners.shape[-1]))
     values[faces] = corners
     return values if np.array_equal(values[faces], corners) else None
 
 
 def _numbers(name: str, given: ArrayLike, dtype: type | None = np.float64) -> np.ndarray:
-    """A copy as an array; tensors that want gradients have none through a mesh."""
+    """Return a copy as an array; gradients do not pass through a mesh."""
     try:
         return np.array(given, dtype=dtype)
     except (TypeError, ValueError, RuntimeError) as error:
@@ -281,7 +292,7 @@ def _numbers(name: str, given: ArrayLike, dtype: type | None = np.float64) -> np
 
 
 def _indices(faces: np.ndarray) -> np.ndarray:
-    """As integers, and none that would become one by being cut off."""
+    """Return faces as integers; refuse numbers that are not whole."""
     if faces.dtype.kind not in "iu" and (faces.dtype.kind != "f" or not np.array_equal(faces, np.trunc(faces))):
         raise InvalidInput("faces", got=f"numbers of {faces.dtype}", expected="vertex indices [F, 3]")
     return faces.astype(np.int64)
@@ -340,7 +351,7 @@ def _check_place(name: str, index: np.ndarray, count: int) -> np.ndarray:
 
 
 def _turned_over(faces: np.ndarray, pattern: np.ndarray) -> np.ndarray:
-    """The pattern with every panel that is drawn from behind mirrored: same cloth, other side up."""
+    """Return the pattern with every panel that is drawn from behind mirrored: the same cloth, other side up."""
     area = signed_area(pattern)
     if (area > 0).all():
         return pattern
@@ -350,7 +361,7 @@ def _turned_over(faces: np.ndarray, pattern: np.ndarray) -> np.ndarray:
 
 
 def _flatten(corners: np.ndarray) -> np.ndarray:
-    """Isometric copies of 3-D triangles [F, 3, 3] in their own planes [F, 3, 2]."""
+    """Return isometric copies of 3-D triangles [F, 3, 3] in their own planes, [F, 3, 2]."""
     a, b = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
     length = np.linalg.norm(a, axis=-1)
     warp = a / np.maximum(length, np.finfo(float).tiny)[:, None]
@@ -361,7 +372,7 @@ def _flatten(corners: np.ndarray) -> np.ndarray:
 
 
 def vertex_normals(x: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """[V, 3] unit normals, the mean of the triangles' around, weighted by area."""
+    """Compute unit normals at the vertices, [V, 3]: the mean of the adjacent triangles, weighted by area."""
     a, b, c = x[faces[:, 0]], x[faces[:, 1]], x[faces[:, 2]]
     total = np.zeros_like(x)
     np.add.at(total, faces, np.cross(b - a, c - a)[:, None])

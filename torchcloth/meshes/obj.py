@@ -1,4 +1,4 @@
-"""The little of Wavefront OBJ that a rest mesh needs: v, vt and f."""
+"""Reading and writing of Wavefront OBJ, as far as a rest mesh needs it: v, vt and f."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import numpy as np
 
 from ..errors import InvalidInput
 
-VALUES_PER_LINE_KIND = {"v": 3, "vt": 2}  # numbers that are read; more may follow
+VALUES_PER_LINE_KIND = {"v": 3, "vt": 2}  # more may follow on a line
 
 
 def parse(text: str, place: str) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
@@ -62,7 +62,7 @@ def parse(text: str, place: str) -> tuple[np.ndarray, np.ndarray, np.ndarray | N
 
 
 def check_convex(polygons: np.ndarray, place: str) -> None:
-    """Refuse polygons [N, K, 3] that a fan of triangles does not cover once.
+    """Check that a fan of triangles covers each of the polygons [N, K, 3] once.
 
     Raises:
         InvalidInput: one is not convex, or folded onto itself.
@@ -76,7 +76,7 @@ def check_convex(polygons: np.ndarray, place: str) -> None:
 
 
 def dump(vertices: np.ndarray, faces: np.ndarray, uv: np.ndarray | None) -> str:
-    """The OBJ text of a mesh with pattern coordinates [V, 2], [F, 3, 2] or None; numbers read back exactly."""
+    """Format a mesh as OBJ text, with pattern coordinates [V, 2], [F, 3, 2] or None; numbers read back exactly."""
     rows, corner, uv = np.zeros((0, 2)), np.asarray(faces), None if uv is None else np.asarray(uv)
     if uv is not None and uv.ndim == 2:
         rows = uv
@@ -92,7 +92,7 @@ def dump(vertices: np.ndarray, faces: np.ndarray, uv: np.ndarray | None) -> str:
 
 
 def _corner(item: str, vertices: int, coordinates: int) -> tuple[int, int]:
-    """Zero-based vertex and vt index of "v", "v/vt" or "v/vt/vn" (-1 without vt); negative ones count from the end."""
+    """Return zero-based vertex and vt index (-1 without) of "v", "v/vt" or "v/vt/vn"; negatives count from the end."""
     first, second, *_ = [*item.split("/"), ""]
     i = int(first) - 1 if int(first) > 0 else vertices + int(first)
     k = -1 if not second else int(second) - 1 if int(second) > 0 else coordinates + int(second)
@@ -102,7 +102,7 @@ def _corner(item: str, vertices: int, coordinates: int) -> tuple[int, int]:
 
 
 def _rows(rows: list, place: str, *shape: int) -> np.ndarray:
-    """Finite numbers [N, *shape], N > 0 unless there are none of their kind to be had."""
+    """Return finite numbers [N, *shape]."""
     try:
         data = np.array(rows, dtype=np.float64)
     except (ValueError, OverflowError):

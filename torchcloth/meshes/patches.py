@@ -1,8 +1,8 @@
-"""Held patches that end where they are said to, and not at the nearest whole vertices.
+"""Gripped patches that end exactly at their radius, not at the nearest vertices.
 
-A patch holds the vertices within its radius: where edges are of 25 mm, one of 36 mm would hold 25 mm of the rim, and
-11 mm of grip move a swinging cloth by millimetres. Here vertices near the patch's edge are moved onto it, in the
-pattern, and those around make room.
+A patch grips the vertices within its radius. With edges of 25 mm, a patch of 36 mm would grip 25 mm of the rim, and 11
+mm of grip move a swinging cloth by millimetres. Here vertices near the patch's edge are moved onto it in the pattern,
+and those around make room.
 """
 
 from __future__ import annotations
@@ -15,42 +15,42 @@ import numpy as np
 from . import topology
 from .mesh import Mesh, signed_area
 
-MAX_EDGE_MOVE_FRACTION = 0.65  # of an edge that crosses the patch's, the farthest that one of its ends moves
-MIN_MOVED_DISTANCE_RADII = 0.5  # radii, from the centre, within which nothing is moved onto the edge
-SMOOTHING_REACH_EDGES = 2.0  # edges, and one radius at least, over which others make room
-MAX_STRAIGHT_RIM_TURN = 0.03  # 1 - cos of the turn at a vertex of the rim along which it may go: 14 degrees
-MIN_LEFT_AREA_FRACTION = 0.25  # of a triangle's area, the least that may be left
+MAX_EDGE_MOVE_FRACTION = 0.65  # of an edge that crosses the patch's edge, by which one of its ends may move
+MIN_MOVED_DISTANCE_RADII = 0.5  # nearer to the centre nothing is moved onto the edge
+SMOOTHING_REACH_EDGES = 2.0  # within it, and within one radius at least, other vertices make room
+MAX_STRAIGHT_RIM_TURN = 0.03  # 1 - cos of the turn at a vertex that may move along the rim: 14 degrees
+MIN_LEFT_AREA_FRACTION = 0.25  # of a triangle's area
 
 
 class Patch(NamedTuple):
-    """All material within ``radius`` [m] of any of the ``centres`` [G, 2] m."""
+    """All material within ``radius`` [m] of any of the ``centres`` [G, 2] m on the pattern."""
 
     centres: np.ndarray
     radius: float
 
     def offset_from_centre(self, uv: np.ndarray) -> np.ndarray:
-        """[N, 2] m, of pattern points from the nearest centre."""
-        away = uv[:, None] - self.centres
-        return away[np.arange(len(uv)), np.linalg.norm(away, axis=-1).argmin(1)]
+        """Return the offsets [N, 2] m of pattern points from the nearest centre."""
+        offsets = uv[:, None] - self.centres
+        return offsets[np.arange(len(uv)), np.linalg.norm(offsets, axis=-1).argmin(1)]
 
     def has_vertices_on_edge(self, uv: np.ndarray) -> bool:
-        """Whether some of the vertices [V, 2] m are on its edge; else the mesh is too coarse, or not made for it."""
+        """Return whether some vertices [V, 2] m lie on the patch's edge; else the mesh is too coarse or not fitted."""
         far = np.linalg.norm(self.offset_from_centre(uv), axis=1)
         return bool((np.abs(far - self.radius) <= 1e-6 * self.radius).any())
 
 
 def fit_to_patches(mesh: Mesh, patches: Sequence[Patch]) -> np.ndarray:
-    """[V, 2] m, pattern coordinates by which no edge of a triangle crosses a patch's; the rim of the cloth stays.
+    """Move pattern coordinates [V, 2] m so that no edge of a triangle crosses the edge of a patch.
 
-    The mesh needs ``uv``. Where an end of the edge would have to go too far, or a triangle were squeezed too much,
-    vertices stay where they are.
+    The mesh needs ``uv``. The rim of the cloth stays. Where an end of an edge would move too far, or a triangle would
+    be squeezed too much, vertices stay where they are.
     """
     uv: np.ndarray = mesh.uv  # type: ignore[assignment]
     free = project_along_rim(mesh, uv)
     onto = np.full_like(uv, np.nan)
     for patch in patches:
-        found = _onto(patch, uv, free, mesh.faces)
-        onto = np.where(np.isnan(onto), found, onto)
+        displacement = _onto(patch, uv, free, mesh.faces)
+        onto = np.where(np.isnan(onto), displacement, onto)
     before = signed_area(uv[mesh.faces])
     while True:
         placed = uv + np.einsum("vij,vj->vi", free, _around(uv, onto, patches, mesh.mean_edge))
@@ -66,10 +66,10 @@ def fit_to_patches(mesh: Mesh, patches: Sequence[Patch]) -> np.ndarray:
 
 
 def _onto(patch: Patch, uv: np.ndarray, free: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """[V, 2] m, displacements onto the patch's edge; NaN of what is not moved there.
+    """Return displacements onto the patch's edge, [V, 2] m; NaN for vertices that are not moved there.
 
-    Of each edge that crosses it one end is enough, that with the shorter way. Three corners of a triangle would leave
-    it hardly any area.
+    For each mesh edge that crosses the patch's edge one end is moved, the one with the shorter way. Three corners of a
+    triangle on the edge would leave it hardly any area.
     """
     ends = topology.find_edges(faces)[0]
     offset = patch.offset_from_centre(uv)
@@ -90,7 +90,7 @@ def _onto(patch: Patch, uv: np.ndarray, free: np.ndarray, faces: np.ndarray) -> 
 
 
 def _reaching(offset: np.ndarray, way: np.ndarray, radius: float) -> np.ndarray:
-    """[V, 2] m, the shortest multiple of each way [V, 2] that leads from an offset [V, 2] m to the radius; or NaN."""
+    """Return the shortest multiple of each ``way`` [V, 2] that leads from its offset [V, 2] m to the radius, or NaN."""
     square, mixed = (way**2).sum(1), (offset * way).sum(1)
     with np.errstate(invalid="ignore", divide="ignore"):
         root = np.sqrt(mixed**2 - square * ((offset**2).sum(1) - radius**2))
@@ -101,14 +101,16 @@ def _reaching(offset: np.ndarray, way: np.ndarray, radius: float) -> np.ndarray:
 
 
 def _around(uv: np.ndarray, onto: np.ndarray, patches: Sequence[Patch], edge: float) -> np.ndarray:
-    """[V, 2] m, displacements of all: like the nearest of those that are moved ``onto`` an edge, less with distance."""
+    """Return displacements of all vertices, [V, 2] m: those of the nearest that are moved, fading with distance."""
     moved = ~np.isnan(onto[:, 0])
     if not moved.any():
         return np.zeros_like(uv)
     apart = np.linalg.norm(uv[:, None] - uv[moved], axis=-1)
     weight = 1 / np.maximum(apart, 1e-3 * edge) ** 4
     move = weight @ onto[moved] / weight.sum(1, keepdims=True)
-    move *= np.clip(1 - apart.min(1) / max(SMOOTHING_REACH_EDGES * edge, *(p.radius for p in patches)), 0.0, 1.0)[:, None]
+    move *= np.clip(1 - apart.min(1) / max(SMOOTHING_REACH_EDGES * edge, *(p.radius for p in patches)), 0.0, 1.0)[
+        :, None
+    ]
     for patch in patches:
         far, after = (np.linalg.norm(patch.offset_from_centre(p), axis=1) for p in (uv, uv + move))
         inside = far <= patch.radius
@@ -118,7 +120,10 @@ def _around(uv: np.ndarray, onto: np.ndarray, patches: Sequence[Patch], edge: fl
 
 
 def project_along_rim(mesh: Mesh, uv: np.ndarray) -> np.ndarray:
-    """[V, 2, 2] projections of displacements: those of the rim along it, where it turns to nothing; others whole."""
+    """Return projections [V, 2, 2] that keep displacements of the rim along it.
+
+    Where the rim turns they are zero; at inner vertices they are the identity.
+    """
     edges = mesh.boundary_edges
     side = uv[edges[:, 1]] - uv[edges[:, 0]]
     normal = np.stack([-side[:, 1], side[:, 0]], 1) / np.linalg.norm(side, axis=1, keepdims=True)

@@ -1,4 +1,4 @@
-"""From a flat drawing of half a garment to a sewn mesh: mirrored, doubled into front and back, welded along seams."""
+"""Sewing: from a flat drawing of half a garment to a mesh, mirrored, doubled into front and back, welded at seams."""
 
 from __future__ import annotations
 
@@ -11,11 +11,13 @@ import numpy as np
 from ..errors import InvalidInput
 from . import topology
 from .mesh import Mesh
-from .triangulation import distance_to_path, triangulate_outline, sample_polyline
+from .triangulation import distance_to_path, sample_polyline, triangulate_outline
 
-PANEL_MARGIN_M = 0.05  # m between panels on the pattern
-LIFT_RAMP_GAPS = 6.0  # gaps over which the layers part from a seam: the placement strains the cloth by 1 / (2 (2 RAMP)^2)
-MAX_EDGE_LENGTH_TRIALS, TRIANGLE_COUNT_TOLERANCE = 8, 0.03  # at the wanted number of triangles
+PANEL_MARGIN_M = 0.05  # between panels on the pattern
+# In gaps, the distance r from a seam over which the layers part. The placement strains the cloth by 1 / (2 (2 r)^2).
+LIFT_RAMP_GAPS = 6.0
+MAX_EDGE_LENGTH_TRIALS = 8  # to reach the wanted number of triangles
+TRIANGLE_COUNT_TOLERANCE = 0.03  # relative
 
 Kind = Literal[
     "sewn",  # front to back
@@ -27,7 +29,7 @@ Kind = Literal[
 
 @dataclass(frozen=True)
 class Curve:
-    """A line of the drawing: points [K, 2] m with x >= 0."""
+    """A line of the drawing, with points [K, 2] m, x >= 0."""
 
     kind: Kind
     points: np.ndarray
@@ -35,7 +37,7 @@ class Curve:
 
 @dataclass(frozen=True)
 class Piece:
-    """A panel of the drawing: its curves counter-clockwise ("-name": backwards) and the direction of its warp."""
+    """A panel of the drawing: its curves counter-clockwise ("-name" is backwards), and the direction of its warp."""
 
     curves: tuple[str, ...]
     warp: tuple[float, float] = (0.0, 1.0)
@@ -62,7 +64,7 @@ class _Flat:
 
 
 def sew(drawing: Drawing, triangles: int, gap: float) -> Mesh:
-    """The mesh with about ``triangles`` triangles, its layers ``gap`` m apart.
+    """Sew a drawing to a mesh of about ``triangles`` triangles, with its layers ``gap`` m apart.
 
     Raises:
         InvalidInput: measures or a number of triangles that give no sound mesh.
@@ -86,22 +88,22 @@ def sew(drawing: Drawing, triangles: int, gap: float) -> Mesh:
 
 
 def _flatten(drawing: Drawing, triangles: int) -> _Flat:
-    """The layer whose double has the wanted number of triangles: the edge length is sought."""
+    """Search for the edge length with which both layers together have the wanted number of triangles."""
     if triangles < 1:
         raise InvalidInput("triangles", got=triangles, expected="a positive number")
     area = _check_drawing(drawing)
-    edge, found = (4 * area / triangles / (0.75**0.5 / 2)) ** 0.5, []
+    edge, halves = (4 * area / triangles / (0.75**0.5 / 2)) ** 0.5, []
     for _ in range(MAX_EDGE_LENGTH_TRIALS):
-        found.append(_half(drawing, edge))
-        count = 4 * len(found[-1].faces)
+        halves.append(_half(drawing, edge))
+        count = 4 * len(halves[-1].faces)
         if abs(count / triangles - 1) < TRIANGLE_COUNT_TOLERANCE:
             break
         edge *= (count / triangles) ** 0.5
-    return _mirrored(drawing, min(found, key=lambda half: abs(4 * len(half.faces) - triangles)))
+    return _mirrored(drawing, min(halves, key=lambda half: abs(4 * len(half.faces) - triangles)))
 
 
 def _half(drawing: Drawing, edge: float) -> _Flat:
-    """The drawing's own half, its pieces joined."""
+    """Triangulate the half that is drawn, and join its pieces."""
     samples = {name: sample_polyline(curve.points, edge) for name, curve in drawing.curves.items()}
     parts, faces, panel, start = [], [], [], 0
     for number, piece in enumerate(drawing.pieces.values()):
@@ -119,19 +121,19 @@ def _half(drawing: Drawing, edge: float) -> _Flat:
 
 
 def _mirrored(drawing: Drawing, half: _Flat) -> _Flat:
-    """Both halves, welded on the middle line; a piece with a fold is one panel, others become two."""
+    """Return both halves, welded on the middle line; a piece with a fold is one panel, others become two."""
     flip = np.array([-1.0, 1.0])
     points, index = _weld(np.vstack([half.points, half.points * flip]))
-    here, there = np.split(index, 2)
+    right, left = np.split(index, 2)
     folded = [
         any(drawing.curves[c.removeprefix("-")].kind == "fold" for c in p.curves) for p in drawing.pieces.values()
     ]
     other = np.where(np.array(folded)[half.panel], half.panel, half.panel + len(folded))
-    on = {("right", name): here[i] for (_, name), i in half.on.items()}
-    on |= {("left", name): there[i] for (_, name), i in half.on.items()}
+    on = {("right", name): right[i] for (_, name), i in half.on.items()}
+    on |= {("left", name): left[i] for (_, name), i in half.on.items()}
     return _Flat(
         points,
-        np.vstack([here[half.faces], there[half.faces][:, ::-1]]),
+        np.vstack([right[half.faces], left[half.faces][:, ::-1]]),
         np.concatenate([half.panel, other]),
         np.vstack([half.warp, half.warp * flip]),
         on,
@@ -139,23 +141,23 @@ def _mirrored(drawing: Drawing, half: _Flat) -> _Flat:
 
 
 def _pattern(flat: _Flat) -> np.ndarray:
-    """[2 F, 3, 2] m, the panels beside each other as they are cut, all with their outer side up, warp along u."""
+    """Return the pattern [2 F, 3, 2] m: panels next to each other as they are cut, outer side up, warp along u."""
     layers, start = [], 0.0
     for side, order in ((1.0, [0, 1, 2]), (-1.0, [2, 1, 0])):
         layer = np.zeros((len(flat.faces), 3, 2))
         for panel, warp in enumerate(flat.warp):
-            own = flat.panel == panel
-            if own.any():
+            in_panel = flat.panel == panel
+            if in_panel.any():
                 laid = flat.points @ np.stack([warp, side * np.array([-warp[1], warp[0]])], axis=1)
-                laid = laid[flat.faces[own][:, order]]
-                layer[own] = laid - laid.min((0, 1)) + [0.0, start]
-                start = layer[own][..., 1].max() + PANEL_MARGIN_M
+                laid = laid[flat.faces[in_panel][:, order]]
+                layer[in_panel] = laid - laid.min((0, 1)) + [0.0, start]
+                start = layer[in_panel][..., 1].max() + PANEL_MARGIN_M
         layers.append(layer)
     return np.concatenate(layers)
 
 
 def _lift(flat: _Flat, sewn: set[str], gap: float) -> np.ndarray:
-    """[N] m, height of the front layer: 0 at seams, half the gap away from them."""
+    """Return the height of the front layer, [N] m: 0 at seams, half the gap far from them."""
     if gap == 0:
         return np.zeros(len(flat.points))
     seams = [flat.points[index] for (_, name), index in flat.on.items() if name in sewn]
@@ -164,7 +166,7 @@ def _lift(flat: _Flat, sewn: set[str], gap: float) -> np.ndarray:
 
 
 def _places(drawing: Drawing, flat: _Flat, behind: np.ndarray) -> dict[str, np.ndarray]:
-    """Corners, openings and seams by name; those that meet their mirror image are one, also named by layer."""
+    """Return corners, openings and seams by name; those that meet their mirror image are one, also by layer."""
     out = {}
     for name, (curve, end) in drawing.corners.items():
         out |= {f"{side} {name}": flat.on[side, curve][[end]] for side in ("left", "right")}
@@ -183,7 +185,7 @@ def _places(drawing: Drawing, flat: _Flat, behind: np.ndarray) -> dict[str, np.n
 
 
 def _check_drawing(drawing: Drawing) -> float:
-    """Area [m^2] of the drawing; refuses pieces that turn over, cross the middle or lie on each other."""
+    """Return the drawing's area [m^2]; refuse pieces that turn over, cross the middle or lie on each other."""
     from matplotlib.path import Path
 
     outlines = {
@@ -208,7 +210,7 @@ def _check_drawing(drawing: Drawing) -> float:
 
 
 def _directed(drawing: Drawing, name: str) -> np.ndarray:
-    """A piece's curve in its direction, without the last point, which is the next one's first."""
+    """Return a piece's curve in its direction, without the last point, which is the next curve's first."""
     points = drawing.curves[name.removeprefix("-")].points
     return points[::-1][:-1] if name[0] == "-" else points[:-1]
 
@@ -219,17 +221,17 @@ def _area(outline: np.ndarray) -> float:
 
 
 def _weld(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """(distinct points, the number of each given one among them)."""
+    """Return the distinct points, and the number of each given point among them."""
     _, first, index = np.unique(_key(points), axis=0, return_index=True, return_inverse=True)
     return points[first], index.ravel()
 
 
 def _find(points: np.ndarray, wanted: np.ndarray) -> np.ndarray:
-    """Numbers of the points that are the wanted ones."""
+    """Return the numbers of the wanted points among ``points``."""
     where = {tuple(row): i for i, row in enumerate(_key(points).tolist())}
     return np.array([where[tuple(row)] for row in _key(wanted).tolist()])
 
 
 def _key(points: np.ndarray) -> np.ndarray:
-    """Micrometres, which no two points of a mesh share."""
+    """Return coordinates in micrometres, which no two points of a mesh share."""
     return np.round(points * 1e6).astype(np.int64)

@@ -12,15 +12,15 @@ from ..errors import InvalidInput, MissingDependency
 from . import obj
 from .mesh import Mesh, check_metres
 
-_INDEX = {"vertex_indices", "vertex_index"}  # names of a PLY's corners
+_INDEX = {"vertex_indices", "vertex_index"}  # names that PLY files use for the vertices of a face
 
 
 def rectangle(
     width: float, height: float, *, triangles: int | None = None, resolution: tuple[int, int] | None = None
 ) -> Mesh:
-    """A flat rectangular sheet in the world's xy plane, lower left corner at the origin.
+    """Build a flat rectangular sheet in the world's xy plane, with its lower left corner at the origin.
 
-    The diagonals alternate, so that the mesh has no preferred shear direction. Material axes: warp = x, weft = y.
+    The diagonals alternate, so the mesh has no preferred shear direction. Material axes: warp = x, weft = y.
 
     Args:
         width: extent along x (warp) [m].
@@ -59,10 +59,10 @@ def rectangle(
 
 
 def load(path: str | Path) -> Mesh:
-    """A cloth mesh from OBJ or PLY (metres); pattern coordinates are taken from the file's texture coordinates if any.
+    """Load a cloth mesh from OBJ or PLY (metres), with the file's texture coordinates, if any, as the pattern.
 
-    Where an OBJ gives a vertex several texture coordinates, panels are sewn there: the mesh stays whole and has the
-    edges as ``seams``.
+    Where an OBJ gives a vertex several texture coordinates, panels are sewn: the mesh stays whole, and the edges are
+    its ``seams``.
 
     Raises:
         InvalidInput: missing or unreadable file, not a usable triangle mesh, or texture coordinates that are not in
@@ -91,12 +91,12 @@ def load(path: str | Path) -> Mesh:
 
 
 def _check_polygons(mesh: Any, path: Path) -> None:
-    """trimesh cuts polygons into fans, whatever they are like."""
+    """Check that polygons are convex: trimesh cuts all into fans."""
     face = (mesh.metadata.get("_ply_raw") or {}).get("face") or {}
     for name in _INDEX & (face.get("properties") or {}).keys():
         corners = _rows(face, name)
-        many = [corners] if corners.ndim == 2 else [np.stack(own) for own in _alike(corners)]
-        for polygons in many:
+        groups = [corners] if corners.ndim == 2 else [np.stack(group) for group in _by_corner_count(corners)]
+        for polygons in groups:
             if polygons.shape[1] > 3:
                 _check_corners(polygons, len(mesh.vertices), path)
                 obj.check_convex(np.asarray(mesh.vertices)[polygons], str(path))
@@ -109,21 +109,20 @@ def _check_corners(polygons: np.ndarray, count: int, path: Path) -> None:
 
 
 def _rows(face: Any, key: str) -> np.ndarray:
-    """A list property of the faces: one row each, of objects where they differ in length."""
-    found = face["data"][key]
-    return np.asarray(found["f1"] if getattr(found.dtype, "names", None) else found)
+    """Return a list property of the faces, one row each; an object array where rows differ in length."""
+    data = face["data"][key]
+    return np.asarray(data["f1"] if getattr(data.dtype, "names", None) else data)
 
 
-def _alike(rows: np.ndarray) -> list[list[np.ndarray]]:
-    """Polygons by their number of corners."""
-    found: dict[int, list[np.ndarray]] = {}
+def _by_corner_count(rows: np.ndarray) -> list[list[np.ndarray]]:
+    groups: dict[int, list[np.ndarray]] = {}
     for row in rows:
-        found.setdefault(len(row), []).append(np.asarray(row))
-    return list(found.values())
+        groups.setdefault(len(row), []).append(np.asarray(row))
+    return list(groups.values())
 
 
 def _wedges(raw: Any, path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
-    """(vertices, faces, coordinates of their corners) of a PLY that gives them per corner, as MeshLab does; else None.
+    """Return vertices, faces and corner coordinates of a PLY that has coordinates per corner, as of MeshLab; or None.
 
     trimesh would tear such a mesh apart at its seams.
     """

@@ -1,4 +1,4 @@
-"""Triangles of even size and good shape inside a flat outline."""
+"""Triangulation of a flat outline by triangles of even size and good shape."""
 
 from __future__ import annotations
 
@@ -7,12 +7,14 @@ import numpy as np
 from ..errors import InvalidInput
 from . import topology
 
-MIN_RIM_DISTANCE_EDGES = 0.6  # edge lengths between the outline and the first inner points
-SPRING_ROUNDS, SPRING_LENGTH_RATIO, SPRING_STEP_FRACTION = 60, 1.15, 0.2  # of spreading: springs push up to PUSH times the mean edge
+MIN_RIM_DISTANCE_EDGES = 0.6  # in edge lengths, between the outline and the first inner points
+SPRING_ROUNDS = 60
+SPRING_LENGTH_RATIO = 1.15  # length at which springs stop pushing, over the mean edge
+SPRING_STEP_FRACTION = 0.2  # of the push, by which points move in a round
 
 
 def sample_polyline(curve: np.ndarray, edge: float) -> np.ndarray:
-    """Points [N, 2] on a polyline [K, 2] in equal steps of about ``edge``, both ends exact."""
+    """Place points [N, 2] on a polyline [K, 2] in equal steps of about ``edge``, with both ends exact."""
     length = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(curve, axis=0), axis=1))])
     stops = np.linspace(0.0, length[-1], max(1, round(length[-1] / edge)) + 1)
     points = np.stack([np.interp(stops, length, curve[:, k]) for k in range(2)], axis=1)
@@ -21,14 +23,17 @@ def sample_polyline(curve: np.ndarray, edge: float) -> np.ndarray:
 
 
 def triangulate_outline(outline: np.ndarray, edge: float) -> tuple[np.ndarray, np.ndarray]:
-    """(points [N, 2], triangles [F, 3], counter-clockwise): the outline's points first, then inner ones.
+    """Triangulate an outline.
 
     A hexagonal lattice whose edges act as springs that push (Persson and Strang 2004, "A simple mesh generator in
     MATLAB", with the outline held): smallest angles come out above 30 degrees where Laplacian smoothing leaves 23.
 
     Args:
         outline: [B, 2] m, counter-clockwise, already in steps of about ``edge``.
-        edge: length [m] wanted.
+        edge: wanted edge length [m].
+
+    Returns:
+        Points [N, 2] m, those of the outline first; and triangles [F, 3], counter-clockwise.
 
     Raises:
         InvalidInput: an outline that crosses itself, or is too narrow for the edge.
@@ -50,7 +55,7 @@ def triangulate_outline(outline: np.ndarray, edge: float) -> tuple[np.ndarray, n
 
 
 def distance_to_path(points: np.ndarray, path: np.ndarray) -> np.ndarray:
-    """[N] m from points [N, 2] to the nearest point of a polyline [K, 2]."""
+    """Compute the distances [N] m of points [N, 2] from the nearest point of a polyline [K, 2]."""
     start, along = path[:-1], np.diff(path, axis=0)
     offset = points[:, None] - start
     t = np.clip((offset * along).sum(-1) / (along**2).sum(-1), 0.0, 1.0)
@@ -58,7 +63,7 @@ def distance_to_path(points: np.ndarray, path: np.ndarray) -> np.ndarray:
 
 
 def _hexagons(low: np.ndarray, high: np.ndarray, edge: float) -> np.ndarray:
-    """Points [N, 2] of a hexagonal lattice that is centred on the box."""
+    """Return points [N, 2] of a hexagonal lattice that is centred on the box."""
     columns, rows = (int(n) // 2 + 1 for n in (high - low) / edge / [1.0, 0.75**0.5])
     i, j = np.meshgrid(np.arange(-columns, columns + 1), np.arange(-rows, rows + 1), indexing="ij")
     lattice = np.stack([i + 0.5 * (j % 2), 0.75**0.5 * j], axis=-1).reshape(-1, 2)
@@ -66,7 +71,7 @@ def _hexagons(low: np.ndarray, high: np.ndarray, edge: float) -> np.ndarray:
 
 
 def _delaunay(points: np.ndarray, outline: np.ndarray, edge: float) -> np.ndarray:
-    """Delaunay triangles [F, 3] inside the outline, without the slivers of points in a row."""
+    """Return Delaunay triangles [F, 3] inside the outline, without the slivers of points in a row."""
     from matplotlib.path import Path
     from matplotlib.tri import Triangulation
 
@@ -79,7 +84,7 @@ def _delaunay(points: np.ndarray, outline: np.ndarray, edge: float) -> np.ndarra
 
 
 def _spread(points: np.ndarray, triangles: np.ndarray, fixed: int) -> np.ndarray:
-    """Points after ``fixed``, pushed by springs along the edges."""
+    """Return the points after springs along the edges have pushed those after the first ``fixed``."""
     ends, _ = topology.find_edges(triangles)
     along = points[ends[:, 1]] - points[ends[:, 0]]
     length = np.linalg.norm(along, axis=1, keepdims=True)
@@ -92,7 +97,7 @@ def _spread(points: np.ndarray, triangles: np.ndarray, fixed: int) -> np.ndarray
 
 
 def _check_outline(triangles: np.ndarray, count: int) -> None:
-    """Refuse triangles whose rim is not the outline: it crosses itself, or parts of it are nearer than an edge."""
+    """Check that the rim is the outline; else it crosses itself, or parts of it are nearer than an edge."""
     sides, uses = topology.find_edges(triangles)
     rim = np.sort(np.stack([np.arange(count), np.roll(np.arange(count), -1)], axis=1), axis=1)
     if not np.array_equal(sides[uses == 1], np.unique(rim, axis=0)):

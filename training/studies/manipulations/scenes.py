@@ -1,8 +1,16 @@
-"""What is done to which garment, and the same scene on any mesh and contact grid."""
+"""Manipulations of garments, and their scenes on any mesh and contact grid.
+
+Contact acts only in part of these scenes. It ignores triangles that are less than about 7 gaps and 3 edges apart along
+the cloth, here 0.5 to 0.7 m. Layers that are nearer along the cloth, such as front and back of a garment over the
+side seam, pass through each other; only large folds touch. A smaller gap needs a finer mesh and smaller steps: one fit
+would take days, and the published numbers would change. So the scenes stay as they are. The library's warning is
+suppressed here; the studies say in their notes that such layers do not touch.
+"""
 
 from __future__ import annotations
 
 import math
+import warnings
 from dataclasses import asdict, dataclass, replace
 from typing import Any, NamedTuple
 
@@ -18,28 +26,44 @@ from torchcloth.materials import AEP
 from torchcloth.meshes import Mesh
 from torchcloth.robots import primitives  # pyright: ignore[reportMissingImports] - mapped from robots/
 from torchcloth.robots.primitives import Action, GripperLimits  # pyright: ignore[reportMissingImports]
-from torchcloth.synthesis.garments import DEFAULT_BENDING_STIFFNESS_NM, BENDING_DAMPING_TIME_S, DEFAULT_AREAL_DENSITY_KG_PER_M2, GARMENTS, build_material, cloth_properties, build_garment_mesh
+from torchcloth.synthesis.garments import (
+    BENDING_DAMPING_TIME_S,
+    DEFAULT_AREAL_DENSITY_KG_PER_M2,
+    DEFAULT_BENDING_STIFFNESS_NM,
+    GARMENTS,
+    build_garment_mesh,
+    build_material,
+    cloth_properties,
+)
+from torchcloth.synthesis.initial_scene import INITIAL_LAYER_DISTANCE_M, MIN_HANGING_HEIGHT_M, TABLE_FRICTION
 
-WORN = ("dress", "trousers", "shirt")
+STUDY_GARMENTS = ("dress", "trousers", "shirt")
 ACTIONS = ("cover", "fling", "drag")
-SPEEDS = {"slow": 0.7, "middle": 0.85, "fast": 1.0}  # m/s, of the grippers at most
+SPEEDS = {"slow": 0.7, "middle": 0.85, "fast": 1.0}  # largest speed of the grippers [m/s]
 GRIPS = {
     "at the corners": (0.0, 0.0),
     "inwards": (0.2, 0.0),
     "lower": (0.0, 0.08),
-}  # share towards the middle, of length
-POSTURES = {"straight": 0.0, "turned left": 0.35, "turned right": -0.35}  # rad, the cloth's body from the motion
-INITIAL_LAYER_DISTANCE_M = 1e-3  # m between front and back at the start
-TABLE_FRICTION = 0.4
-MIN_HANGING_HEIGHT_M = 0.12  # m above the table, of hanging cloth
-PLATE_DRAG_COEFFICIENT = 1.2  # of a flat plate, broadside
-COARSE_GRIP_RADIUS_M = 0.05  # m, radius of what a gripper holds: on a coarse mesh, enough for some vertices
-REST_TIME_S = 0.12  # s, after the grippers open
+}  # fraction towards the middle, fraction of the length downwards
+POSTURES = {"straight": 0.0, "turned left": 0.35, "turned right": -0.35}  # angle of the body from the motion [rad]
+PLATE_DRAG_COEFFICIENT = 1.2  # of a flat plate across the flow
+COARSE_GRIP_RADIUS_M = 0.05  # large enough for some vertices of a coarse mesh
+REST_TIME_S = 0.12  # after the grippers open
 
 
 @dataclass(frozen=True)
 class Manipulation:
-    """One way to move a garment; ``number`` seeds the sensor's errors, ``slower`` divides the grippers' speed."""
+    """A manipulation of a garment.
+
+    Attributes:
+        garment: one of ``STUDY_GARMENTS``.
+        number: index of the manipulation, and seed of the sensor's errors.
+        action: one of ``ACTIONS``.
+        speed: key of ``SPEEDS``.
+        grip: key of ``GRIPS``.
+        posture: key of ``POSTURES``.
+        slower: divides the grippers' speed.
+    """
 
     garment: str
     number: int
@@ -51,16 +75,16 @@ class Manipulation:
 
     @property
     def name(self) -> str:
-        """Of its case."""
+        """Name of the case."""
         return f"{self.garment}-{self.number:02d}-{self.action}"
 
     def facts(self) -> dict[str, Any]:
-        """As a case keeps it."""
+        """Return the manipulation as a case stores it."""
         return asdict(self)
 
 
 def manipulations(garment: str, count: int = 10) -> list[Manipulation]:
-    """Actions and levels of the factors by Latin squares: in nine, an action meets every level once."""
+    """Return manipulations by Latin squares: among nine, each action meets each level of a factor once."""
     speeds, grips, postures = (list(levels) for levels in (SPEEDS, GRIPS, POSTURES))
     out = []
     for i in range(count):
@@ -71,7 +95,7 @@ def manipulations(garment: str, count: int = 10) -> list[Manipulation]:
 
 
 class Fabric(NamedTuple):
-    """The values that a fit seeks, by the names that it uses; SI units."""
+    """Values of the fitted parameters in SI units."""
 
     youngs_modulus: float
     poisson_ratio: float
@@ -82,27 +106,33 @@ class Fabric(NamedTuple):
 
     @classmethod
     def true(cls, garment: str) -> Fabric:
-        """The paper's E and nu as the preset reads them, with the softer contact of ``torchcloth simulate``."""
+        """Return the true values: the paper's E and nu, with the softer contact of ``torchcloth simulate``."""
         law = build_material(GARMENTS[garment].fabric)
         names = cls._fields[:4]
         return cls(*(float(getattr(law, name).value.detach()) for name in names))
 
     def start(self) -> Fabric:
-        """Where the fit begins: everything is off by a factor of 1.25 to 2."""
+        """Return the start of the fit, where all values are wrong by a factor of 1.25 to 2."""
         e, nu, k, gamma, bending, air = self
         return Fabric(1.5 * e, 2.0 * nu, 2.0 * k, 0.5 * gamma, 1.5 * bending, 0.8 * air)
 
     def named(self) -> dict[str, float]:
-        """By the parameters' public names."""
+        """Return the values by the parameters' public names."""
         *law, bending, air = self
         return {**dict(zip(self._fields, law, strict=False)), "bending.stiffness": bending, "air.normal": air}
 
 
 class Discretisation(NamedTuple):
-    """Mesh, contact grid, and substep as a share of the stable one."""
+    """Discretisation of a scene.
+
+    Attributes:
+        triangles: approximate number.
+        gap: distance of layers that touch [m].
+        step: substep as a fraction of the stable one.
+    """
 
     triangles: int
-    gap: float  # m between layers that touch
+    gap: float
     step: float = 1.0
 
 
@@ -110,14 +140,14 @@ class Scene:
     """A manipulation on one discretisation.
 
     Attributes:
-        mesh: the garment where it starts.
-        rest: [V, 3] m, its vertices in its own frame.
-        held: gripper -> vertices in its grip.
+        mesh: the garment at its start.
+        rest: [V, 3] m, vertices in the garment's frame.
+        gripped_vertices: indices of the vertices in each gripper.
         action: paths of the grippers.
-        hangs: whether it hangs at the start, else it lies on the table.
+        hangs: whether the garment hangs at the start; else it lies on the table.
 
     Raises:
-        InvalidInput: a mesh so coarse that a grip holds nothing.
+        InvalidInput: the mesh is so coarse that a grip contains no vertex.
     """
 
     def __init__(self, what: Manipulation, fine: Discretisation) -> None:
@@ -128,13 +158,15 @@ class Scene:
         self.mesh = Mesh.build(self._placed(self.rest), made.faces, made.pattern, made.places)
         places = self._grips(made)
         apart = {name: np.linalg.norm(self.rest - place, axis=1) for name, place in places.items()}
-        self.held = {name: np.flatnonzero(distance <= COARSE_GRIP_RADIUS_M) for name, distance in apart.items()}
-        if not all(len(held) for held in self.held.values()):
+        self.gripped_vertices = {
+            name: np.flatnonzero(distance <= COARSE_GRIP_RADIUS_M) for name, distance in apart.items()
+        }
+        if not all(len(gripped_vertices) for gripped_vertices in self.gripped_vertices.values()):
             raise InvalidInput("--triangles", got=fine.triangles, expected="a vertex in every grip, so more triangles")
         self.action = self._action({name: tuple(self._placed(place[None])[0]) for name, place in places.items()})
 
     def cloth(self, fabric: Fabric) -> tc.Cloth:
-        """The garment with these values."""
+        """Build the garment with these values."""
         h = cloth_properties(self.garment.fabric)["thickness"]
         law = AEP(*fabric[:2], contact_stiffness=fabric[2], shear_stiffness=fabric[3], thickness=h)
         effects = {
@@ -142,14 +174,16 @@ class Scene:
             "air": AirDrag(fabric.air),
             "bending": Bending(fabric.bending, damping_time=BENDING_DAMPING_TIME_S),
         }
-        boundaries = {name: Grasp(held.tolist()) for name, held in self.held.items()}
+        boundaries = {name: Grasp(vertices.tolist()) for name, vertices in self.gripped_vertices.items()}
         table = Plane(friction=TABLE_FRICTION, offset=INITIAL_LAYER_DISTANCE_M / 2)
-        return tc.Cloth(
-            self.mesh, law, DEFAULT_AREAL_DENSITY_KG_PER_M2, effects, {**boundaries, "table": table}, Contact.with_gap(self.fine.gap)
-        )
+        boundaries = {**boundaries, "table": table}
+        with warnings.catch_warnings():
+            warnings.filterwarnings("ignore", "contact: .* over another layer")  # see the module's docstring
+            contact = Contact.with_gap(self.fine.gap)
+            return tc.Cloth(self.mesh, law, DEFAULT_AREAL_DENSITY_KG_PER_M2, effects, boundaries, contact)
 
     def _grips(self, made: Mesh) -> dict[str, np.ndarray]:
-        """Gripper -> [3] m, the middle of its pad in the garment's own frame."""
+        """Return the centre [3] m of each gripper's pad in the garment's frame."""
         inwards, lower = GRIPS[self.what.grip]
         places = [made.vertices[made.places[place]].mean(0) for place in self.garment.grips]
         middle = (places[0] + places[1]) / 2
@@ -157,12 +191,12 @@ class Scene:
         return {name: place + s for name, place, s in zip(("left", "right"), places, shifts, strict=True)}
 
     def _placed(self, points: np.ndarray) -> np.ndarray:
-        """[N, 3] m in the world, of points in the garment's frame: hanging by its grips, or on the table.
+        """Transform points [N, 3] m from the garment's frame to the world: hanging by its grips, or on the table.
 
-        Away from the arms is +x; the gripped end is up, or towards the arms. The body is turned about the vertical.
+        +x points away from the arms. The gripped end is up, or towards the arms. The body is turned about the vertical.
         """
         x, y, z = points.T
-        z = z * (INITIAL_LAYER_DISTANCE_M / (meshes.garments.LAYER_GAP_M * self.garment.scale))
+        z = z * (INITIAL_LAYER_DISTANCE_M / (meshes.garments.GARMENT_GAP_M * self.garment.scale))
         if self.hangs:
             forward, side, up = z, x, MIN_HANGING_HEIGHT_M + self.length / 2 + y
         else:
@@ -179,7 +213,7 @@ class Scene:
         )
 
     def _action(self, grips: dict[str, tuple[float, ...]]) -> Action:
-        """Away for cover and fling, towards the arms for drag."""
+        """Return the action: away from the arms for cover and fling, towards them for drag."""
         speed = SPEEDS[self.what.speed] / self.what.slower
         limits = GripperLimits(speed, 8.0 * speed**2)
         if self.what.action == "fling":
@@ -191,10 +225,10 @@ class Scene:
 
 
 def slowed(what: Manipulation, length: float, fine: Discretisation) -> Manipulation:
-    """The same with grippers so slow that it takes ``length`` seconds.
+    """Return the manipulation with slower grippers, so that it takes ``length`` seconds.
 
     Raises:
-        InvalidInput: it takes longer as it is.
+        InvalidInput: it takes longer already.
     """
     lasts = min(float(path.t[-1]) for path in Scene(what, fine).action.motion.values())
     if length < lasts:
