@@ -8,11 +8,11 @@ import pytest
 from torchcloth.training.studies import air, air_tables
 from torchcloth.training.studies.command import main
 
-FOUND = {"before": [0.07, 0.09], "after": [0.03, 0.05]}  # m, of two groups
+GROUP_RMS = {"before": [0.07, 0.09], "after": [0.03, 0.05]}  # m, of two groups
 
 
 def predicted(std=0.003):
-    rows = {f"{w} g{k}": {"rms": v, "rms_std": std} for w, own in FOUND.items() for k, v in enumerate(own)}
+    rows = {f"{w} g{k}": {"rms": v, "rms_std": std} for w, values in GROUP_RMS.items() for k, v in enumerate(values)}
     rows = {name: {**row, "frequency": 1.0, "decay": 5.0} for name, row in rows.items()}
     rows = {name: {**row, "frequency_std": 0.01, "decay_std": 1.0} for name, row in rows.items()}
     other = {"still": {"rms": 0.01, "rms_std": 0.001}, "null": {"rms": 0.04, "rms_std": 0.002}}
@@ -33,27 +33,27 @@ def answer(*effects):
 
 def test_groups_are_of_different_sizes_and_share_no_run():
     names = ["range30_rep1", "range30_rep2", "range60_rep1", "range60_rep2", "range90_rep1", "range90_rep2"]
-    assert air.grouped(names) == [names[0::2], names[1::2]]
-    assert air.grouped(names[:5]) == [names[:5:2]]
+    assert air.group_by_size(names) == [names[0::2], names[1::2]]
+    assert air.group_by_size(names[:5]) == [names[:5:2]]
 
 
 def test_an_error_knows_of_runs_and_of_groups():
     """0.07 and 0.09: their mean errs by 0.01 between groups, and by 0.003 between runs."""
-    found = air.pooled(predicted(), ["g0", "g1"])
-    assert found["before"]["rms"] == pytest.approx(0.08)
-    assert found["before"]["rms_std"] == pytest.approx(np.hypot(0.01, 0.003))
-    assert found["after"]["frequency_std"] == pytest.approx(0.01)
-    assert air.pooled(predicted(), ["g0"])["before"]["rms_std"] == pytest.approx(0.003)
+    result = air.pool_groups(predicted(), ["g0", "g1"])
+    assert result["before"]["rms"] == pytest.approx(0.08)
+    assert result["before"]["rms_std"] == pytest.approx(np.hypot(0.01, 0.003))
+    assert result["after"]["frequency_std"] == pytest.approx(0.01)
+    assert air.pool_groups(predicted(), ["g0"])["before"]["rms_std"] == pytest.approx(0.003)
 
 
 def test_the_table_counts_what_is_named_first(capsys):
     groups = {"a": answer("air.linear", "obs.clock"), "b": answer("obs.clock", "air.linear"), "c": answer()}
-    pooled = air.pooled(predicted(), ["g0", "g1", "g1"])
+    pooled = air.pool_groups(predicted(), ["g0", "g1", "g1"])
     air_tables.show({"groups": groups, "predicted_runs": ["range30_rep2"], "predicted": pooled})
-    said = capsys.readouterr().out
-    assert "air is named before any other cause in 1 of 3 groups, another cause in 1" in said
-    assert "mass itself cannot be told: mass.density cannot be seen in 3 groups" in said
-    assert "0.920 (0.900 to 0.940)" in said
+    printed = capsys.readouterr().out
+    assert "air is named before any other cause in 1 of 3 groups, another cause in 1" in printed
+    assert "the mass itself is not identifiable: mass.density is unresolvable in 3 groups" in printed
+    assert "0.920 (0.900 to 0.940)" in printed
 
 
 def test_without_data_it_says_so(tmp_path, monkeypatch, capsys):
@@ -72,9 +72,9 @@ def test_fast_study(realdata, tmp_path, capsys):
     for _ in range(2):
         assert main(["air", "--fast", "--source", str(realdata), "--out", str(tmp_path)]) == 0
     assert capsys.readouterr().out.count("min left") == 2
-    found = json.loads((tmp_path / "air.json").read_text())
-    [group] = found["groups"].values()
-    assert air_tables.first(group).startswith("air.")
+    result = json.loads((tmp_path / "air.json").read_text())
+    [group] = result["groups"].values()
+    assert air_tables.first_cause(group).startswith("air.")
     assert group["gain"]["rms_after"] < 0.8 * group["gain"]["rms_before"]
-    assert found["predicted"]["after"]["rms"] < found["predicted"]["before"]["rms"]
+    assert result["predicted"]["after"]["rms"] < result["predicted"]["before"]["rms"]
     assert (tmp_path / "air.png").is_file()

@@ -18,13 +18,13 @@ def call(out, *more):
 def test_the_table_has_every_method_beside_the_others(tmp_path, capsys):
     assert call(tmp_path, "--problems", "sheet") == 0
     printed = capsys.readouterr().out
-    found = json.loads((tmp_path / "cost.json").read_text())["cases"]
-    assert list(found) == ["sheet-gauss-newton", "sheet-descent", "sheet-paper"]
-    for case in found.values():
+    results = json.loads((tmp_path / "cost.json").read_text())["cases"]
+    assert list(results) == ["sheet-gauss-newton", "sheet-descent", "sheet-paper"]
+    for case in results.values():
         assert case["method"] in printed
         assert case["processor"] > 0
         assert case["frames"] == 8
-    newton, descent, paper = found.values()
+    newton, descent, paper = results.values()
     assert newton["chamfer_after"] <= descent["chamfer_after"] * 1.01
     assert abs(newton["youngs_modulus"] - 1) < 0.2 < abs(descent["youngs_modulus"] - 1)
     assert 1 < paper["youngs_modulus"] < 2.5  # of cells of 50 mm no fit has its vertices nearer than the rule's 15 mm
@@ -33,12 +33,12 @@ def test_the_table_has_every_method_beside_the_others(tmp_path, capsys):
 
 def test_the_shirt_is_as_slow_as_asked():
     fine = Discretisation(130, 0.06)
-    what = slowed(manipulations("shirt")[cost.DRAG], 3.0, fine)
+    what = slowed(manipulations("shirt")[cost.DRAG_NUMBER], 3.0, fine)
     path = Scene(what, fine).action.motion["left"]
     assert float(path.t[-1]) == pytest.approx(3.0, abs=0.02)
     torch.set_default_dtype(torch.float64)
-    problem = cost.shirt(cost.FAST)
-    assert problem.names == list(cost.cases.SOUGHT)
+    problem = cost.build_shirt_problem(cost.FAST_SCALE)
+    assert problem.names == list(cost.cases.PAPER_PARAMETERS)
     assert problem.cloth.material.youngs_modulus.value.item() == pytest.approx(1.5 * problem.truth["youngs_modulus"])
 
 

@@ -8,14 +8,14 @@ import pytest
 import torch
 
 from torchcloth.training.studies import command
-from torchcloth.training.studies.manipulations import cases, joint, options, paper
-from torchcloth.training.studies.manipulations.measures import pooled, spread
+from torchcloth.training.studies.manipulations import cases, joint, study_cases, paper_tables
+from torchcloth.training.studies.manipulations.measures import pooled_variance, sample_spread
 from torchcloth.training.studies.manipulations.scenes import (
     ACTIONS,
     GRIPS,
     POSTURES,
     SPEEDS,
-    WORN,
+    STUDY_GARMENTS,
     Discretisation,
     Fabric,
     Scene,
@@ -36,25 +36,25 @@ def test_factors_are_balanced_over_actions_and_each_other():
     assert len({(m.grip, m.posture) for m in nine}) == 9
 
 
-@pytest.mark.parametrize("garment", WORN)
+@pytest.mark.parametrize("garment", STUDY_GARMENTS)
 @pytest.mark.parametrize("number", range(3))
 def test_scenes_start_at_their_grips_above_the_table_whatever_the_mesh(garment, number):
-    what = manipulations(garment)[number]
-    coarse, fine = (Scene(what, Discretisation(n, 0.06)) for n in (130, 300))
+    manipulation = manipulations(garment)[number]
+    coarse, fine = (Scene(manipulation, Discretisation(n, 0.06)) for n in (130, 300))
     for scene in (coarse, fine):
         assert scene.mesh.vertices[:, 2].min() > 0
-        for name, held in scene.held.items():
+        for name, vertices in scene.gripped_vertices.items():
             hand = scene.action.motion[name].pose[0, :3, 3].numpy()
-            assert np.linalg.norm(scene.mesh.vertices[held].mean(0) - hand) < 0.05
+            assert np.linalg.norm(scene.mesh.vertices[vertices].mean(0) - hand) < 0.05
     for name, path in coarse.action.motion.items():
         np.testing.assert_allclose(path.pose, fine.action.motion[name].pose, atol=0.02)
 
 
 def test_the_truth_is_the_papers_and_the_start_is_wrong():
-    for garment in WORN:
+    for garment in STUDY_GARMENTS:
         true, start = Fabric.true(garment), Fabric.true(garment).start()
-        assert true.youngs_modulus == pytest.approx(1e3 * paper.PARAMETERS["youngs_modulus"][garment][0])
-        assert true.poisson_ratio == pytest.approx(paper.PARAMETERS["poisson_ratio"][garment][0])
+        assert true.youngs_modulus == pytest.approx(1e3 * paper_tables.PARAMETERS["youngs_modulus"][garment][0])
+        assert true.poisson_ratio == pytest.approx(paper_tables.PARAMETERS["poisson_ratio"][garment][0])
         ratios = np.array(list(start.named().values())) / np.array(list(true.named().values()))
         assert (np.abs(np.log(ratios)) > 0.2).all()
 
@@ -63,24 +63,24 @@ def test_the_truth_is_the_papers_and_the_start_is_wrong():
 
 
 def test_coefficient_of_variation_is_the_samples():
-    over = spread([1.0, 2.0, 3.0])
+    over = sample_spread([1.0, 2.0, 3.0])
     assert (over.mean, over.count) == (2.0, 3)
     assert over.cov == pytest.approx(0.5)
-    assert math.isnan(spread([1.0]).cov)
-    assert math.isnan(spread([]).mean)
+    assert math.isnan(sample_spread([1.0]).cov)
+    assert math.isnan(sample_spread([]).mean)
 
 
 def test_the_papers_pooled_variance_is_that_of_all_values():
     rng = np.random.default_rng(0)
     values = rng.normal(size=12)
-    first = pooled({"a": values[:4], "b": values[4:7], "c": values[7:], "none": []})
-    other = pooled({"a": values[::2], "b": values[1::2]})
-    assert first.pooled == pytest.approx(values.var())
-    assert other.pooled == pytest.approx(values.var())
+    first = pooled_variance({"a": values[:4], "b": values[4:7], "c": values[7:], "none": []})
+    other = pooled_variance({"a": values[::2], "b": values[1::2]})
+    assert first.pooled_variance == pytest.approx(values.var())
+    assert other.pooled_variance == pytest.approx(values.var())
     assert first.mean == pytest.approx(values.mean())
     assert set(first.levels) == {"a", "b", "c"}
-    assert pooled({"a": [1.0, 1.0], "b": [3.0, 3.0]}).between == pytest.approx(1.0)
-    assert math.isnan(pooled({"a": []}).pooled)
+    assert pooled_variance({"a": [1.0, 1.0], "b": [3.0, 3.0]}).between == pytest.approx(1.0)
+    assert math.isnan(pooled_variance({"a": []}).pooled_variance)
 
 
 # -- cases -----------------------------------------------------------------------------------------------------------
@@ -90,25 +90,27 @@ def test_the_papers_pooled_variance_is_that_of_all_values():
 def solved():
     """A dragged dress."""
     torch.set_default_dtype(torch.float64)
-    return cases.solve(SMALL, manipulations("dress")[2])
+    return cases.solve_case(SMALL, manipulations("dress")[2])
 
 
 def test_a_case_holds_estimates_and_distances(solved):
     assert solved["truth"]["youngs_modulus"] == pytest.approx(129320)
-    assert set(solved["found"]) == {*cases.SOUGHT, *cases.FREE}
+    assert set(solved["estimates"]) == {*cases.PAPER_PARAMETERS, *cases.EXTRA_PARAMETERS}
     assert 0.05 < solved["hidden"] < 0.7
-    far = solved["distance"]
-    assert far["fit"]["surface"] < 0.2 * far["null"]["surface"], "a simulation follows the cloth, a rigid one does not"
-    for state in far.values():
+    distance = solved["distance"]
+    assert distance["fit"]["surface"] < 0.2 * distance["null"]["surface"], (
+        "a simulation follows the cloth, a rigid one does not"
+    )
+    for state in distance.values():
         assert state["surface"] < state["vertices"]
     # nothing is folded yet: what contact seems to move is the ripples of simulations spread around the solution
     assert solved["moves_mm"]["youngs_modulus"] > 2 * solved["moves_mm"]["contact_stiffness"]
-    assert not solved["found"]["contact_stiffness"]["identifiable"]
+    assert not solved["estimates"]["contact_stiffness"]["identifiable"]
     json.dumps(solved, allow_nan=False)
 
 
 def test_only_early_frames_are_fitted():
-    model, data = cases.seen(SMALL, manipulations("dress")[2])
+    model, data = cases.simulate_observation(SMALL, manipulations("dress")[2])
     early = data.until(0.5)
     points, all_points = early.recording.require("points"), data.recording.require("points")
     assert len(points.t) == len(early.x) == round(len(all_points.t) / 2)
@@ -128,23 +130,27 @@ def call(name, out, *more):
 def pretended(solved, factor):
     """A solver that returns the solved case for every manipulation, its E estimated at ``factor`` times the truth."""
 
-    def solve(setup, what):
-        found = {name: dict(e) for name, e in solved["found"].items()}
-        e, truth = found["youngs_modulus"], Fabric.true(what.garment).named()
-        value = factor * truth["youngs_modulus"] * (1 + 0.1 * what.number)
+    def solve(setup, manipulation):
+        estimates = {name: dict(e) for name, e in solved["estimates"].items()}
+        e, truth = estimates["youngs_modulus"], Fabric.true(manipulation.garment).named()
+        value = factor * truth["youngs_modulus"] * (1 + 0.1 * manipulation.number)
         e |= {"identifiable": True, "value": value, "ci95": [0.9 * value, 1.1 * value]}
-        return solved | {"manipulation": what.facts(), "truth": truth, "found": found}
+        return solved | {"manipulation": manipulation.facts(), "truth": truth, "estimates": estimates}
 
     return solve
 
 
 def test_three_studies_share_their_cases(solved, tmp_path, monkeypatch, capsys):
-    done = []
+    computed = []
     solve = pretended(solved, 0.95)
-    monkeypatch.setattr(options, "solve", lambda setup, what: done.append(what.name) or solve(setup, what))
+    monkeypatch.setattr(
+        study_cases,
+        "solve_case",
+        lambda setup, manipulation: computed.append(manipulation.name) or solve(setup, manipulation),
+    )
     assert call("garments", tmp_path, "--count", "3") == 0
     printed = capsys.readouterr().out
-    assert len(done) == 9
+    assert len(computed) == 9
     assert "not identifiable" in printed
     assert "638.7" in printed, "the paper's number beside it"
     result = json.loads((tmp_path / "garments.json").read_text())["garments"]["dress"]
@@ -162,18 +168,24 @@ def test_three_studies_share_their_cases(solved, tmp_path, monkeypatch, capsys):
 
     assert call("factors", tmp_path, "--count", "3") == 0
     assert "8.74e-05" in capsys.readouterr().out
-    found = json.loads((tmp_path / "factors.json").read_text())
-    e = found["parameters_over_truth"]["grip"]["youngs_modulus"]
+    estimates = json.loads((tmp_path / "factors.json").read_text())
+    e = estimates["parameters_over_truth"]["grip"]["youngs_modulus"]
     assert e["mean"] == pytest.approx(0.95 * 1.1)
-    assert e["between"] == pytest.approx(e["pooled"]), "with three manipulations a level of grip is one of them"
-    assert len(done) == 9, "nothing was run again"
+    assert e["between"] == pytest.approx(e["pooled_variance"]), (
+        "with three manipulations a level of grip is one of them"
+    )
+    assert len(computed) == 9, "nothing was run again"
     for name in ("garments", "chamfer", "factors"):
         assert (tmp_path / f"{name}.png").stat().st_size > 10_000
 
 
 def test_a_failed_case_is_counted_and_no_number(solved, tmp_path, monkeypatch, capsys):
     case = {key: solved[key] for key in ("truth", "hidden")}
-    monkeypatch.setattr(options, "solve", lambda setup, what: case | {"manipulation": what.facts(), "failed": "torn"})
+    monkeypatch.setattr(
+        study_cases,
+        "solve_case",
+        lambda setup, manipulation: case | {"manipulation": manipulation.facts(), "failed": "torn"},
+    )
     for name in ("garments", "chamfer", "factors"):
         assert call(name, tmp_path, "--garments", "dress") == 0
         assert "nan" not in capsys.readouterr().out
@@ -199,29 +211,32 @@ def test_refusals_write_nothing(arguments, message, tmp_path, capsys):
 
 
 def test_another_setting_needs_another_folder(solved, tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr(options, "solve", pretended(solved, 1.0))
+    monkeypatch.setattr(study_cases, "solve_case", pretended(solved, 1.0))
     assert call("garments", tmp_path, "--garments", "dress") == 0
     assert call("chamfer", tmp_path, "--garments", "dress", "--gap", "0.07") == 2
     assert "gap" in capsys.readouterr().err
 
 
-def test_a_joint_fit_takes_what_is_held_alike_and_calm(solved, tmp_path, monkeypatch, capsys):
-    asked = {}
+def test_a_joint_fit_takes_calm_cases_with_the_same_grips(solved, tmp_path, monkeypatch, capsys):
+    fitted = {}
 
-    def solve_together(setup, whats):
-        asked[whats[0].garment] = [what.number for what in whats]
-        return {**pretended(solved, 0.9)(setup, whats[0]), "manipulations": [what.facts() for what in whats]}
+    def solve_together(setup, manipulated):
+        fitted[manipulated[0].garment] = [manipulation.number for manipulation in manipulated]
+        return {
+            **pretended(solved, 0.9)(setup, manipulated[0]),
+            "manipulations": [manipulation.facts() for manipulation in manipulated],
+        }
 
     monkeypatch.setattr(joint, "solve_together", solve_together)
     ask = "--joint", "--count", "10", "--garments", "dress"
     assert call("garments", tmp_path, *ask, "--report") == 2
     assert "no finished case" in capsys.readouterr().err
-    assert asked == {}
+    assert fitted == {}
     assert call("garments", tmp_path, *ask) == 0
-    assert asked == {"dress": [0, 5, 9]}, "covers and drags at the corners"
-    asked.clear()
+    assert fitted == {"dress": [0, 5, 9]}, "covers and drags at the corners"
+    fitted.clear()
     assert call("garments", tmp_path, *ask, "--report") == 0
-    assert asked == {}
+    assert fitted == {}
     printed = capsys.readouterr().out
     assert "0.81 … 0.99" in printed
     assert "3 episodes" in printed
@@ -229,10 +244,10 @@ def test_a_joint_fit_takes_what_is_held_alike_and_calm(solved, tmp_path, monkeyp
 
 @pytest.mark.slow
 def test_two_manipulations_can_be_fitted_at_once():
-    together = cases.solve_together(SMALL, [manipulations("dress")[i] for i in (2, 6)])  # both held lower
-    assert set(together["found"]) == {*cases.SOUGHT, *cases.FREE}
-    assert len(together["manipulations"]) == 2
-    json.dumps(together, allow_nan=False)
+    joint_fit = cases.solve_together(SMALL, [manipulations("dress")[i] for i in (2, 6)])  # both held lower
+    assert set(joint_fit["estimates"]) == {*cases.PAPER_PARAMETERS, *cases.EXTRA_PARAMETERS}
+    assert len(joint_fit["manipulations"]) == 2
+    json.dumps(joint_fit, allow_nan=False)
 
 
 @pytest.mark.slow
@@ -242,5 +257,5 @@ def test_the_fast_studies(tmp_path, capsys):
         assert call(name, tmp_path) == 0
     by = json.loads((tmp_path / "chamfer.json").read_text())["by"]["action"]
     for action in ACTIONS:
-        own = by[action]["surface"]
-        assert own["fit"]["mean"] < own["null"]["mean"], action
+        distances = by[action]["surface"]
+        assert distances["fit"]["mean"] < distances["null"]["mean"], action

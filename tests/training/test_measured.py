@@ -119,7 +119,7 @@ def test_frequency_and_decay_are_found_with_their_spread():
     draw, t = np.random.default_rng(0), np.linspace(0, 2.5, 26)
     rows = []
     for size in (0.05, 0.07, 0.06, 0.08):
-        q = free_swing.waves(t, 0.9, 30.0, size, 0.02) + 1e-3 * draw.normal(size=len(t))
+        q = free_swing.damped_oscillation(t, 0.9, 30.0, size, 0.02) + 1e-3 * draw.normal(size=len(t))
         rows.append({"swing_t": t.tolist(), "swing_q": q.tolist(), "squares": 4.0, "count": 100, "median": 0.1})
     runs = {str(k): {"measured": row, "null": row, "still": row, "model": row} for k, row in enumerate(rows)}
     result = swing_predictions.summary(runs, ["model"], draws=5)

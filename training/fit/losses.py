@@ -46,11 +46,11 @@ class Loss:
             InvalidInput: the episode has data for none of the losses.
         """
         parts = [LOSSES[name](scene, scale) for name, scale in self.scales.items()]
-        rows_of_block = [part for part in parts if part is not None]
-        if not rows_of_block:
+        losses = [part for part in parts if part is not None]
+        if not losses:
             expected = f"data for {' or '.join(self.scales)}"
             raise InvalidInput(f"{scene.episode.name}: nothing to compare with", got="none of it", expected=expected)
-        return torch.stack(rows_of_block).sum()
+        return torch.stack(losses).sum()
 
 
 def chamfer(scene: SimulatedEpisode) -> Tensor | None:

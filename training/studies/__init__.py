@@ -1,1 +1,1 @@
-"""The paper's experiments with its tables beside ours: ``python -m torchcloth.training.studies NAME``."""
+"""Studies, among them the paper's experiments with its tables: ``python -m torchcloth.training.studies NAME``."""

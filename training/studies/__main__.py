@@ -1,4 +1,4 @@
-"""``python -m torchcloth.training.studies``."""
+"""Run ``python -m torchcloth.training.studies``."""
 
 import sys
 

@@ -1,96 +1,106 @@
-"""Which fabric is it? From the trials of ``fabrics``: each is left out in turn and given to the nearest fabric.
+"""Classify fabrics: each trial of the study ``fabrics`` is left out in turn and assigned to the nearest fabric.
 
-Nearest by Mahalanobis distance in the identified parameters; its covariance is the trial's own error, the spread of the
-fabric's other trials beyond their errors, and the error of their mean. ``--out`` may be the folder of ``fabrics``:
-trials that it holds are not repeated.
+The distance is the Mahalanobis distance in the identified parameters. Its covariance is the sum of the trial's error,
+the excess scatter of the fabric's other trials, and the error of their mean. ``--out`` may be the folder of
+``fabrics``, whose trials are then not repeated.
 """
 
 from __future__ import annotations
 
 import argparse
-import json
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from torchcloth._utils.files import write_text
-
-from ..resumable import ResumableStudy
+from ..resumable import ResumableStudy, write_result
 from . import classification_figures
-from .fabric_tables import table
-from .fabric_trials import PAIR, stretches
-from .fabrics import LABEL, add, chosen
+from .fabric_tables import make_table
+from .fabric_trials import MEMBRANE_PARAMETERS, stretch_cases
+from .fabrics import STUDY_TEXT, add, choose_scale
 from .paper_fabrics import CLAIM, FABRICS
 
-FEWEST = 2  # other trials of a fabric, for a mean and a spread
-SETS = {"E and ν": PAIR, "E alone": PAIR[:1], "ν alone": PAIR[1:]}
-UNLIKELY = {1: 3.84, 2: 5.99}  # squared distance that one in twenty exceeds (chi squared, by the number of parameters)
+MIN_OTHER_TRIALS = 2  # of a fabric, for mean and scatter
+PARAMETER_SETS = {
+    "E and ν": MEMBRANE_PARAMETERS,
+    "E alone": MEMBRANE_PARAMETERS[:1],
+    "ν alone": MEMBRANE_PARAMETERS[1:],
+}
+CHI2_95 = {1: 3.84, 2: 5.99}  # 95 % quantile of chi squared by the number of parameters
 
 __all__ = ["add", "run"]
 
 
 class Trial(NamedTuple):
-    """What a trial says, in coordinates in which errors are normal."""
+    """Estimates of a trial, in coordinates in which errors are normal.
+
+    Attributes:
+        fabric: true fabric.
+        place: [P], log E and logit 2 nu.
+        error: [P], standard deviation.
+    """
 
     fabric: str
-    place: np.ndarray  # [P]: log E, logit 2 nu
-    error: np.ndarray  # [P] its standard deviation
+    place: np.ndarray
+    error: np.ndarray
 
 
 def run(options: argparse.Namespace) -> None:
-    """Compute what is missing, then print, draw and write classify.json."""
-    scale = chosen(options)
-    cases = ResumableStudy(options.out, scale.settings()).run(stretches(scale))
-    results = {title: confusion(_trials(cases.values(), names), scale.fabrics) for title, names in SETS.items()}
-    content = {"what": LABEL, "paper": f'"{CLAIM}"; no table, no number', "sets": results}
-    write_text(options.out / "classify.json", json.dumps(content, indent=1, allow_nan=False, ensure_ascii=False) + "\n")
+    """Compute the missing cases, then print, draw and write classify.json."""
+    scale = choose_scale(options)
+    cases = ResumableStudy(options.out, scale.settings()).run(stretch_cases(scale))
+    results = {
+        title: confusion_matrix(_trials(cases.values(), names), scale.fabrics)
+        for title, names in PARAMETER_SETS.items()
+    }
+    content = {"what": STUDY_TEXT, "paper": f'"{CLAIM}"; no table, no number', "sets": results}
+    write_result(options.out / "classify.json", "classify", content)
     _show(results)
-    picture = classification_figures.draw(options.out, _trials(cases.values(), PAIR), results)
+    picture = classification_figures.draw(options.out, _trials(cases.values(), MEMBRANE_PARAMETERS), results)
     print(f"result:  {options.out / 'classify.json'}\npicture: {picture}")
 
 
 def _trials(cases: Iterable[Mapping[str, Any]], names: Sequence[str]) -> list[Trial]:
-    """Of the cases that know all the parameters."""
+    """Return the trials in which all parameters are identifiable."""
     out = []
     for case in cases:
-        own = [case["parameters"][name] for name in names]
-        if all(e["identifiable"] for e in own):
-            pairs = [_normal(name, e["value"], e["std"]) for name, e in zip(names, own, strict=True)]
+        entries = [case["parameters"][name] for name in names]
+        if all(e["identifiable"] for e in entries):
+            pairs = [_to_normal_coordinates(name, e["value"], e["std"]) for name, e in zip(names, entries, strict=True)]
             out.append(Trial(case["fabric"], *(np.array(column) for column in zip(*pairs, strict=True))))
     return out
 
 
-def _normal(name: str, value: float, std: float) -> tuple[float, float]:
-    """(log, or logit of twice the value for Poisson's ratio; its standard deviation)."""
+def _to_normal_coordinates(name: str, value: float, std: float) -> tuple[float, float]:
+    """Return the logarithm, or the logit of twice Poisson's ratio, and its standard deviation."""
     if name == "poisson_ratio":
         return float(np.log(value / (0.5 - value))), std * 0.5 / (value * (0.5 - value))
     return float(np.log(value)), std / value
 
 
-def confusion(trials: Sequence[Trial], fabrics: Sequence[str]) -> dict[str, Any]:
-    """Each trial left out and assigned.
+def confusion_matrix(trials: Sequence[Trial], fabrics: Sequence[str]) -> dict[str, Any]:
+    """Assign each trial with the others of its fabric as reference.
 
     Returns:
-        ``matrix`` true fabric -> assigned fabric -> count; ``right`` of the ``trials`` of fabrics with enough others;
-        ``within``: how many are so near their own fabric as 95 % should be; ``margin``: least distance from a wrong
-        fabric, in standard deviations, over all trials; ``distance`` true fabric -> fabric -> mean distance.
+        ``matrix``: true fabric -> assigned fabric -> count. ``trials``: number of trials of fabrics with enough others;
+        ``right``: number of correct ones. ``within``: number within the 95 % distance of their fabric. ``margin``:
+        smallest distance from a wrong fabric in standard deviations. ``distance``: true fabric -> fabric -> mean.
     """
     matrix = {a: dict.fromkeys(fabrics, 0) for a in fabrics}
     distances: dict[str, dict[str, list[float]]] = {a: {b: [] for b in fabrics} for a in fabrics}
     within = judged = 0
     for i, trial in enumerate(trials):
         others = [t for j, t in enumerate(trials) if j != i]
-        squared = {name: _squared(trial, [t for t in others if t.fabric == name]) for name in fabrics}
+        squared = {name: _squared_distance(trial, [t for t in others if t.fabric == name]) for name in fabrics}
         known = {name: d for name, d in squared.items() if d is not None}
-        if trial.fabric not in known:  # the others of its own fabric are too few: it could only be wrong
+        if trial.fabric not in known:  # its fabric has too few other trials: the answer could only be wrong
             continue
         judged += 1
         matrix[trial.fabric][min(known, key=lambda name: known[name])] += 1
-        within += known[trial.fabric] <= UNLIKELY[len(trial.place)]
+        within += known[trial.fabric] <= CHI2_95[len(trial.place)]
         for name, d in known.items():
             distances[trial.fabric][name].append(d**0.5)
-    wrong = [d for a, row in distances.items() for b, own in row.items() if a != b for d in own]
+    wrong = [d for a, row in distances.items() for b, entries in row.items() if a != b for d in entries]
     return {
         "trials": judged,
         "right": sum(matrix[name][name] for name in fabrics),
@@ -101,20 +111,20 @@ def confusion(trials: Sequence[Trial], fabrics: Sequence[str]) -> dict[str, Any]
     }
 
 
-def _squared(trial: Trial, others: Sequence[Trial]) -> float | None:
-    """Squared Mahalanobis distance of a trial from a fabric's others; None where these are too few."""
-    if len(others) < FEWEST:
+def _squared_distance(trial: Trial, others: Sequence[Trial]) -> float | None:
+    """Return the squared Mahalanobis distance of a trial from a fabric's others; None if these are too few."""
+    if len(others) < MIN_OTHER_TRIALS:
         return None
     places, errors = np.stack([t.place for t in others]), np.stack([t.error for t in others])
     spread = np.atleast_2d(np.cov(places.T, ddof=1))
-    own, theirs = np.diag(trial.error**2), np.diag((errors**2).mean(0))
-    beyond = _positive(spread - theirs)
-    off = trial.place - places.mean(0)
-    return float(off @ np.linalg.solve(own + beyond + (theirs + beyond) / len(others), off))
+    trial_cov, others_cov = np.diag(trial.error**2), np.diag((errors**2).mean(0))
+    excess = _nearest_covariance(spread - others_cov)
+    deviation = trial.place - places.mean(0)
+    return float(deviation @ np.linalg.solve(trial_cov + excess + (others_cov + excess) / len(others), deviation))
 
 
-def _positive(matrix: np.ndarray) -> np.ndarray:
-    """The nearest covariance: negative eigenvalues become zero."""
+def _nearest_covariance(matrix: np.ndarray) -> np.ndarray:
+    """Return the nearest covariance, with negative eigenvalues set to zero."""
     values, vectors = np.linalg.eigh(matrix)
     return (vectors * values.clip(min=0)) @ vectors.T
 
@@ -126,15 +136,15 @@ def _show(results: Mapping[str, Mapping[str, Any]]) -> None:
     console.width = max(console.width, 118)
     for title, result in results.items():
         headings = [FABRICS[name] for name in result["matrix"]]
-        out = table(f"From {title}: each trial left out, and assigned to", "is in truth", *headings, left=1)
+        out = make_table(f"From {title}: each trial left out, and assigned to", "is in truth", *headings, left=1)
         for name, row in result["matrix"].items():
-            away = result["distance"][name]
-            out.add_row(FABRICS[name], *(_cell(row[other], away[other]) for other in row))
+            distances_text = result["distance"][name]
+            out.add_row(FABRICS[name], *(_cell(row[other], distances_text[other]) for other in row))
         console.print(out)
         n, margin = result["trials"], result["margin"]
-        away = "–" if margin is None else f"{margin:.1f}"
+        distances_text = "–" if margin is None else f"{margin:.1f}"
         console.print(
-            f"{result['right']} of {n} right; nearest wrong fabric {away} standard deviations away; {result['within']} "
+            f"{result['right']} of {n} right; nearest wrong fabric {distances_text} standard deviations away; {result['within']} "
             f"of {n} as near their own as 95 % should be. In brackets: mean distance.\n",
             markup=False,
         )

@@ -1,4 +1,7 @@
-"""``python -m torchcloth.training.studies NAME --out DIR``: one module a study, each with ``add`` and ``run``."""
+"""Command ``python -m torchcloth.training.studies NAME --out DIR``.
+
+Each study is a module of this package. ``add(parser)`` declares its options, ``run(options)`` runs it.
+"""
 
 from __future__ import annotations
 
@@ -9,8 +12,7 @@ from pathlib import Path
 
 from ..resumable import run_study_command
 
-# Modules of this package; ``add(parser)`` declares options, ``run(options)`` does it.
-STUDIES: tuple[str, ...] = (
+STUDY_NAMES: tuple[str, ...] = (
     "fabrics",
     "garments",
     "chamfer",
@@ -22,14 +24,14 @@ STUDIES: tuple[str, ...] = (
     "reach",
     "trajectories",
     "hidden",
-    "parts",
-    "salting",
+    "screening",
+    "fault_injection",
     "air",
 )
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Entry point; returns the exit code (0 done, 2 wrong input, 130 interrupted)."""
+    """Run the command; return the exit code (0 done, 2 wrong input, 130 interrupted)."""
     options = _parser().parse_args(arguments)
     study = import_module(f".{options.study}", __package__)
     return run_study_command("studies", "finished cases", lambda: study.run(options))
@@ -38,11 +40,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog="python -m torchcloth.training.studies", description=__doc__)
     studies = parser.add_subparsers(dest="study", required=True, metavar="NAME")
-    for name in STUDIES:
+    for name in STUDY_NAMES:
         module = import_module(f".{name}", __package__)
-        said = (module.__doc__ or "").partition("\n")[0]
-        own = studies.add_parser(name, help=said, description=module.__doc__)
-        own.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder for cases, tables and pictures")
-        own.add_argument("--fast", action="store_true", help="a reduced version: a minute or two")
-        module.add(own)
+        summary = (module.__doc__ or "").partition("\n")[0]
+        subparser = studies.add_parser(name, help=summary, description=module.__doc__)
+        subparser.add_argument(
+            "--out", type=Path, required=True, metavar="DIR", help="folder for cases, tables and pictures"
+        )
+        subparser.add_argument("--fast", action="store_true", help="run a reduced version, which takes a minute or two")
+        module.add(subparser)
     return parser

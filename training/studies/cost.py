@@ -1,4 +1,4 @@
-"""What a fit costs, beside plain gradient descent on the same problem: a sheet of 800 triangles, a shirt of 1500."""
+"""Cost of a fit compared with gradient descent on the same problem: a sheet of 800 triangles, a shirt of 1500."""
 
 from __future__ import annotations
 
@@ -14,41 +14,46 @@ from torchcloth.episodes.unknowns import find_scalar_parameters
 from torchcloth.errors import InvalidInput
 from torchcloth.identification import identify
 
-from ..resumable import ResumableStudy
+from ..resumable import ResumableStudy, write_result
 from . import stretching
 from .manipulations import cases
-from .manipulations.console_tables import heading_table, mm, number, show, write
+from .manipulations.console_tables import heading_table, mm, number, show
 from .manipulations.scenes import Discretisation, Fabric, Manipulation, manipulations, slowed
 
 if TYPE_CHECKING:
     from torchcloth import Cloth
     from torchcloth.recordings import Recording
 
-DRAG = 2  # the number of a manipulation without folds
-SHEET = stretching.Fabric(60.0, 0.3, 0.25)  # N/m, -, kg/m^2
-OFF = {"youngs_modulus": 2.5, "poisson_ratio": 2 / 3, "bending.stiffness": 1.5, "air.normal": 0.8}  # of the start
-METHODS: dict[str, dict[str, Any]] = {
+DRAG_NUMBER = 2  # a manipulation without folds
+SHEET_FABRIC = stretching.Fabric(60.0, 0.3, 0.25)  # N/m, -, kg/m^2
+START_FACTORS = {
+    "youngs_modulus": 2.5,
+    "poisson_ratio": 2 / 3,
+    "bending.stiffness": 1.5,
+    "air.normal": 0.8,
+}  # start over truth
+METHOD_OPTIONS: dict[str, dict[str, Any]] = {
     "gauss-newton": {"method": "gauss-newton"},
     "descent": {"method": "gradient-descent"},
     "paper": {"method": "adam", "stop": "paper"},
 }
-PROMISED = {"sheet": 1.5, "shirt": 15.0}  # min, on two free cores
+PROMISED_MINUTES = {"sheet": 1.5, "shirt": 15.0}  # on two free cores
 
 
 @dataclass(frozen=True)
 class Scale:
-    """How large the two problems are.
+    """Size of both problems.
 
     Attributes:
-        cell: m, of the sheet's mesh; the truth's are half of it.
-        frames: of the sheet, 30 a second.
-        triangles: of the shirt in the fit, about; the truth's has half as many again.
-        gap: m between the shirt's layers; by default those of its mesh would rest 1.4 edges apart, 35 mm.
-        length: s, of the shirt's drag over a table; None: as fast as in the other studies, about 1 s.
+        cell: edge length of the sheet's mesh [m]; half of it for the truth.
+        frames: number of frames of the sheet, 30 per second.
+        triangles: approximate number for the shirt in the fit; the truth has 1.5 times as many.
+        gap: distance of the shirt's layers at rest [m]; the default is 1.4 edges of its mesh.
+        length: duration of the shirt's drag over a table [s]; None: about 1 s, as in the other studies.
         rate: frames per second of the shirt.
-        sheet_iterations: of Gauss-Newton on all frames, at most; by default that of ``identify``.
-        shirt_iterations: likewise, of the shirt; by default that of the other studies of garments.
-        descent: steps of gradient descent and Adam, at most.
+        sheet_iterations: most Gauss-Newton iterations on all frames; the default is that of ``identify``.
+        shirt_iterations: likewise for the shirt; the default is that of the other studies of garments.
+        descent: most steps of gradient descent and Adam.
     """
 
     cell: float = 0.01225
@@ -62,7 +67,7 @@ class Scale:
     descent: int = 10
 
 
-FAST = Scale(
+FAST_SCALE = Scale(
     cell=0.05,
     frames=8,
     triangles=130,
@@ -76,9 +81,17 @@ FAST = Scale(
 
 
 class Problem(NamedTuple):
-    """What all methods are given; descent and Adam look at its clouds alone."""
+    """A problem for all methods; gradient descent and Adam use its clouds only.
 
-    cloth: Cloth  # at the start values
+    Attributes:
+        cloth: at the start values.
+        recording: data.
+        names: of the fitted parameters.
+        truth: true values by name.
+        iterations: most Gauss-Newton iterations.
+    """
+
+    cloth: Cloth
     recording: Recording
     names: list[str]
     truth: dict[str, float]
@@ -86,69 +99,73 @@ class Problem(NamedTuple):
 
 
 def add(parser: argparse.ArgumentParser) -> None:
-    """Options."""
+    """Add the study's options."""
     option = parser.add_argument
-    known = list(PROMISED)
-    option("--problems", nargs="+", choices=known, default=known, metavar="NAME", help="sheet, shirt (both)")
-    option("--triangles", type=int, metavar="N", help="of the shirt in the fit, about (1500)")
-    option("--gap", type=float, metavar="M", help="between the shirt's layers [m] (0.035)")
-    option("--length", type=float, metavar="SECONDS", help="of the shirt's motion (3)")
-    option("--descent", type=int, metavar="N", help="steps of gradient descent and of Adam (10; the paper's: 35)")
+    problems = list(PROMISED_MINUTES)
+    option(
+        "--problems", nargs="+", choices=problems, default=problems, metavar="NAME", help="sheet, shirt (default: both)"
+    )
+    option("--triangles", type=int, metavar="N", help="approximate number for the shirt in the fit (default: 1500)")
+    option("--gap", type=float, metavar="M", help="distance of the shirt's layers [m] (default: 0.035)")
+    option("--length", type=float, metavar="SECONDS", help="duration of the shirt's motion (default: 3)")
+    option("--descent", type=int, metavar="N", help="steps of gradient descent and Adam (default: 10; the paper: 35)")
 
 
-def run(chosen: argparse.Namespace) -> None:
-    """Every method on every problem."""
-    scale = FAST if chosen.fast else Scale()
-    changes = {key: v for key in ("triangles", "gap", "length", "descent") if (v := getattr(chosen, key)) is not None}
+def run(options: argparse.Namespace) -> None:
+    """Run each method on each problem and print the table."""
+    scale = FAST_SCALE if options.fast else Scale()
+    changes = {key: v for key in ("triangles", "gap", "length", "descent") if (v := getattr(options, key)) is not None}
     for key, value in changes.items():
         if not 0 < value < float("inf"):
             raise InvalidInput(f"--{key}", got=value, expected="a number > 0")
     scale = replace(scale, **changes)
-    makers: dict[str, Callable[[Scale], Problem]] = {"sheet": sheet, "shirt": shirt}
-    study = ResumableStudy(chosen.out, asdict(scale))
-    found = study.run(
+    builders: dict[str, Callable[[Scale], Problem]] = {"sheet": build_sheet_problem, "shirt": build_shirt_problem}
+    study = ResumableStudy(options.out, asdict(scale))
+    results = study.run(
         {
-            f"{problem}-{method}": partial(_measure, makers[problem], scale, problem, method)
-            for problem in chosen.problems
-            for method in METHODS
+            f"{problem}-{method}": partial(_measure, builders[problem], scale, problem, method)
+            for problem in options.problems
+            for method in METHOD_OPTIONS
         }
     )
-    show(_table(found), NOTE)
-    write(chosen.out / "cost.json", {"cases": found, "promised_minutes": PROMISED})
+    show(_table(results), TABLE_NOTE)
+    write_result(options.out / "cost.json", "cost", {"cases": results, "promised_minutes": PROMISED_MINUTES})
 
 
-def sheet(scale: Scale) -> Problem:
-    """Pulled by two clamps for a second: E, nu, bending and drag from clouds, markers and forces.
+def build_sheet_problem(scale: Scale) -> Problem:
+    """Build the sheet: pulled by two clamps for a second; E, nu, bending and drag from clouds, markers and forces.
 
-    Where the clamps hold is known to half a millimetre only, which no method is told.
+    The places of the clamps have an error of half a millimetre, which no method knows.
     """
     detail = stretching.Detail(scale.cell, scale.frames)
-    recording = stretching.record(SHEET, stretching.Pull("x"), 5, detail)
-    cloth = stretching.sheet(recording, SHEET)
+    recording = stretching.record_trial(SHEET_FABRIC, stretching.Pull("x"), 5, detail)
+    cloth = stretching.build_sheet(recording, SHEET_FABRIC)
     names = find_scalar_parameters(cloth)
-    parameters: dict[str, Any] = {name: cloth.get_submodule(names[name]) for name in OFF}
+    parameters: dict[str, Any] = {name: cloth.get_submodule(names[name]) for name in START_FACTORS}
     truth = {name: float(p.value.detach()) for name, p in parameters.items()}
-    for name, off in OFF.items():
-        parameters[name].set(off * truth[name])
-    return Problem(cloth, recording, list(OFF), truth, scale.sheet_iterations)
+    for name, factor in START_FACTORS.items():
+        parameters[name].set(factor * truth[name])
+    return Problem(cloth, recording, list(START_FACTORS), truth, scale.sheet_iterations)
 
 
-def shirt(scale: Scale) -> Problem:
-    """Dragged over a table: E, nu, k and gamma from clouds of a part of it."""
+def build_shirt_problem(scale: Scale) -> Problem:
+    """Build the shirt: dragged over a table; E, nu, k and gamma from partial clouds."""
     setup = cases.Setup(scale.triangles, scale.gap, scale.rate)
-    what: Manipulation = manipulations("shirt")[DRAG]
+    what: Manipulation = manipulations("shirt")[DRAG_NUMBER]
     if scale.length is not None:
         what = slowed(what, scale.length, Discretisation(scale.triangles, scale.gap))
-    model, data = cases.seen(setup, what)
+    model, data = cases.simulate_observation(setup, what)
     true = Fabric.true("shirt")
-    return Problem(model.cloth(true.start()), data.recording, list(cases.SOUGHT), true.named(), scale.shirt_iterations)
+    return Problem(
+        model.cloth(true.start()), data.recording, list(cases.PAPER_PARAMETERS), true.named(), scale.shirt_iterations
+    )
 
 
 def _measure(make: Callable[[Scale], Problem], scale: Scale, name: str, method: str) -> dict[str, Any]:
-    """Seconds on the clock and of the processor, simulations, distances and values of one search."""
-    p, options = make(scale), METHODS[method]
+    """Run one search; return its time, CPU time, simulations, distances and values."""
+    p, options = make(scale), METHOD_OPTIONS[method]
     count = p.iterations if options["method"] == "gauss-newton" else scale.descent
-    begun, used = time.perf_counter(), time.process_time()
+    started, cpu_started = time.perf_counter(), time.process_time()
     fit = identify(p.cloth, p.recording, p.names, iterations=count, **options)
     keys = ("simulations", "iterations", "converged", "chamfer_before", "chamfer_after")
     e = fit.parameters["youngs_modulus"]
@@ -158,8 +175,8 @@ def _measure(make: Callable[[Scale], Problem], scale: Scale, name: str, method: 
         "triangles": len(p.cloth.mesh.faces),
         "length": float(p.recording.require("points").t[-1]),
         "frames": len(p.recording.require("points")),
-        "seconds": time.perf_counter() - begun,
-        "processor": time.process_time() - used,
+        "seconds": time.perf_counter() - started,
+        "processor": time.process_time() - cpu_started,
         "load": os.getloadavg()[1],
         "early": sum(entry["frames"] < 1 for entry in fit.history),
         "youngs_modulus": e.value / p.truth["youngs_modulus"],
@@ -169,12 +186,12 @@ def _measure(make: Callable[[Scale], Problem], scale: Scale, name: str, method: 
     }
 
 
-def _table(found: dict[str, dict[str, Any]]):
+def _table(results: dict[str, dict[str, Any]]):
     table = heading_table(
         "Cost of a fit of four parameters", "problem", "method", "triangles", "frames", "iterations", "simulations",
         "CPU", "clock", "load", "Chamfer [mm]", "E / truth",
     )  # fmt: skip
-    for row in found.values():
+    for row in results.values():
         table.add_row(
             row["problem"],
             row["method"],
@@ -191,11 +208,10 @@ def _table(found: dict[str, dict[str, Any]]):
     return table
 
 
-NOTE = (
-    "descent: plain gradient descent; paper: Adam with the paper's stop, that loss below 15 mm. Both follow "
-    "the paper's loss (cloud to nearest vertex), in logarithms, without markers and forces, which Gauss-Newton uses, "
-    "and have no test of convergence. *: stopped there, not converged. "
-    "?: called not identifiable. Iterations: of all stages. CPU: of the fit alone; clock: with what "
-    "else ran; load: processes that wanted to run, mean of 5 minutes. Chamfer: one-sided, cloud to surface, at start "
-    "and end. Gauss-Newton counts each of its tangents as a simulation, and ends with error bars."
+TABLE_NOTE = (
+    "descent: plain gradient descent. paper: Adam with the paper's stop at a loss below 15 mm. Both minimise the paper's "
+    "loss (cloud to nearest vertex) in logarithms of the parameters. They use no markers and forces and have no test of "
+    "convergence. *: stopped, not converged. ?: not identifiable. Iterations: of all stages. CPU: of the fit alone. "
+    "clock: elapsed time. load: runnable processes, mean of 5 minutes. Chamfer: one-sided, cloud to surface, at start "
+    "and end. Gauss-Newton counts each of its tangents as a simulation and gives error bars."
 )

@@ -1,4 +1,4 @@
-"""Pictures of the fabric study: the experiment from above, and every trial's error."""
+"""Figures of the fabric study: the experiment from above, and the error of each trial."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ import numpy as np
 from torchcloth._utils.files import write_atomically
 
 from . import stretching
-from .fabric_trials import Scale, fabric, seed_of, truth
+from .fabric_trials import Scale, seed_of, sheet_fabric, true_values
 from .paper_fabrics import COV, FABRICS, SYMBOLS
 from .stretching import Pull
 
-COLOURS = {"x": "#1f6f8b", "y": "#b0653a", "45": "#3d7f3d", "press": "#1f6f8b", "elsewhere": "#b0653a"}
-KINDS = {
+KIND_COLOURS = {"x": "#1f6f8b", "y": "#b0653a", "45": "#3d7f3d", "press": "#1f6f8b", "elsewhere": "#b0653a"}
+KIND_LABELS = {
     "band": "the paper's CoV",
     "x": "pulled along x",
     "y": "along y",
@@ -27,7 +27,7 @@ KINDS = {
 
 
 def draw(folder: Path, scale: Scale, cases: Mapping[str, Mapping[str, Any]]) -> list[Path]:
-    """Write stretching.png and fabrics.png; returns their paths."""
+    """Write stretching.png and fabrics.png; return their paths."""
     figures = {"stretching.png": _experiment(scale), "fabrics.png": _errors(scale, cases)}
     for name, figure in figures.items():
         with write_atomically(folder / name) as part:
@@ -36,7 +36,7 @@ def draw(folder: Path, scale: Scale, cases: Mapping[str, Mapping[str, Any]]) -> 
 
 
 def _experiment(scale: Scale) -> Any:
-    """First and last frame of one trial in each direction, from above."""
+    """Draw first and last frame of one trial in each direction, from above."""
     from matplotlib.figure import Figure
 
     shown = {pull.direction: pull for pull in reversed(scale.pulls)}
@@ -52,7 +52,7 @@ def _experiment(scale: Scale) -> Any:
 
 def _trial(axis: Any, scale: Scale, pull: Pull) -> None:
     name = scale.fabrics[0]
-    recording = stretching.record(fabric(name), pull, seed_of(name, 0), scale.detail)
+    recording = stretching.record_trial(sheet_fabric(name), pull, seed_of(name, 0), scale.detail)
     points, markers = recording.points, recording.markers
     if points is None or markers is None:
         raise RuntimeError("a trial without points")  # what record always gives
@@ -60,53 +60,60 @@ def _trial(axis: Any, scale: Scale, pull: Pull) -> None:
     way = markers.xyz[last] - markers.xyz[0]
     axis.plot(*points.frame(last)[:, :2].T, ".", ms=3, color="#9db8c4", label="points of the last frame")
     axis.quiver(*markers.xyz[0][:, :2].T, *way[:, :2].T, angles="xy", scale_units="xy", scale=1, width=2.5e-3)
-    axis.plot(*markers.xyz[0][:, :2].T, ".", ms=2, color="black", label="markers, and how far they go")
+    axis.plot(*markers.xyz[0][:, :2].T, ".", ms=2, color="black", label="markers and their motion")
     for grip, colour in (("still", "#444444"), ("moving", "#c0392b")):
-        held = recording.grasps[grip].uv
-        if held is not None:
+        clamp_points = recording.grasps[grip].uv
+        if clamp_points is not None:
             path = recording.grippers[grip].position
             origin = pull.size * (np.arange(2) == 1 - pull.axis) / 2
             origin = origin + pull.size * (np.arange(2) == pull.axis) * (grip == "moving")
-            line = held - origin + path[-1][:2]
+            line = clamp_points - origin + path[-1][:2]
             axis.plot(*line.T, color=colour, lw=4, solid_capstyle="butt", label=f"{grip} clamp")
     axis.set(aspect="equal", xlabel="x [m]")
 
 
 def _errors(scale: Scale, cases: Mapping[str, Mapping[str, Any]]) -> Any:
-    """Every trial of E and nu by stretching, of k and gamma by the press."""
+    """Draw the errors of E and nu from stretching trials, and of k and gamma from presses."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(2.4 + 2.1 * len(scale.fabrics), 10.0), layout="constrained")
     for axis, (symbol, parameter) in zip(figure.subplots(4, 1), SYMBOLS.items(), strict=True):
         for place, name in enumerate(scale.fabrics):
             cov = COV[name][symbol]
-            axis.fill_between([place - 0.42, place + 0.42], -cov, cov, color="#e8e8e8", lw=0, label=_once(axis, "band"))
+            axis.fill_between(
+                [place - 0.42, place + 0.42], -cov, cov, color="#e8e8e8", lw=0, label=_legend_label(axis, "band")
+            )
             _points(axis, place, name, parameter, cases)
         axis.axhline(0.0, color="black", lw=0.8)
-        axis.set(xticks=range(len(scale.fabrics)), ylabel=f"{symbol}: off by [%]")
+        axis.set(xticks=range(len(scale.fabrics)), ylabel=f"{symbol}: error [%]")
         axis.set_xticklabels([FABRICS[name] for name in scale.fabrics])
         axis.margins(y=0.25)
         axis.legend(fontsize=7, loc="upper right", ncols=4)
     return figure
 
 
-def _once(axis: Any, kind: str) -> str | None:
-    """A label for the legend, the first time."""
+def _legend_label(axis: Any, kind: str) -> str | None:
+    """Return the label of a kind if the legend does not have it yet."""
     drawn = axis.get_legend_handles_labels()[1]
-    return None if KINDS[kind] in drawn else KINDS[kind]
+    return None if KIND_LABELS[kind] in drawn else KIND_LABELS[kind]
 
 
 def _points(axis: Any, place: int, name: str, parameter: str, cases: Mapping[str, Mapping[str, Any]]) -> None:
-    own = {key: c for key, c in cases.items() if key.startswith(name) and _kind(key) and parameter in c["parameters"]}
-    for i, (key, case) in enumerate(own.items()):
+    selected = {
+        key: c for key, c in cases.items() if key.startswith(name) and _kind(key) and parameter in c["parameters"]
+    }
+    for i, (key, case) in enumerate(selected.items()):
         e, kind = case["parameters"][parameter], case.get("direction", _kind(key))
         if not e["identifiable"]:
             continue
-        off, bar = 100 * (e["value"] / truth(name)[parameter] - 1), 100 * e["std"] / truth(name)[parameter]
-        at = place + 0.7 * ((i + 0.5) / len(own) - 0.5)
-        axis.errorbar(at, off, bar, fmt="o", ms=4, color=COLOURS[kind], label=_once(axis, kind))
+        error_percent, bar = (
+            100 * (e["value"] / true_values(name)[parameter] - 1),
+            100 * e["std"] / true_values(name)[parameter],
+        )
+        at = place + 0.7 * ((i + 0.5) / len(selected) - 0.5)
+        axis.errorbar(at, error_percent, bar, fmt="o", ms=4, color=KIND_COLOURS[kind], label=_legend_label(axis, kind))
 
 
 def _kind(key: str) -> str:
-    """pull, press or elsewhere; empty for other cases."""
+    """Return "pull", "press" or "elsewhere"; empty for other cases."""
     return next((kind for kind in ("pull", "press", "elsewhere") if f"-{kind}-" in key), "")

@@ -1,4 +1,4 @@
-"""What one does without physics: points alone, frame by frame. For comparison only."""
+"""Baselines without physics, from points alone and frame by frame, for comparison only."""
 
 from __future__ import annotations
 
@@ -11,12 +11,13 @@ from torchcloth.meshes import Mesh
 from torchcloth.observe.least_squares import Equations, expand_to_axes, solve_moves
 from torchcloth.observe.shape_prior import ShapePrior
 
-ROUNDS, STRAIN = 8, 0.01  # of matching points anew; standard deviation of the strain of an edge
-FAST = 1e-4  # m, how well a held vertex is known
+MATCHING_ROUNDS = 8  # of closest points
+EDGE_STRAIN_STD = 0.01  # of the length prior
+GRIP_STD_M = 1e-4  # of gripped vertices
 
 
-def snapped(frames: Tensor, episode: Episode, reach: float) -> Tensor:
-    """[T, V, 3] m: every vertex moved to the measured point that is nearest to it, where one is within reach [m]."""
+def snap_to_points(frames: Tensor, episode: Episode, reach: float) -> Tensor:
+    """Move each vertex to the nearest measured point within ``reach`` [m]; return [T, V, 3] m."""
     out = frames.clone()
     for t, cloud in enumerate(episode.clouds):
         if len(cloud):
@@ -25,28 +26,36 @@ def snapped(frames: Tensor, episode: Episode, reach: float) -> Tensor:
     return out
 
 
-def registered(episode: Episode, mesh: Mesh, held: Tensor, places: Tensor, noise: float) -> Tensor:
-    """[T, V, 3] m: a non-rigid registration of every frame, begun where the two before it lead.
+def register_frames(episode: Episode, mesh: Mesh, gripped: Tensor, gripped_positions: Tensor, noise: float) -> Tensor:
+    """Register each frame non-rigidly, starting from an extrapolation of the two frames before.
 
-    Points pull the surface along its normal, and in its plane where they lie beyond its rim; edges keep their length,
-    curvature is small, held vertices are where the grippers have them: ``observe.align`` without its search for a pose.
+    Points pull the surface along its normal, and in its plane if they lie beyond its boundary. Edges keep their
+    length, curvature is small, and gripped vertices follow the grippers. This is ``observe.align`` without its search
+    for a pose.
 
     Args:
-        episode: clouds, first shape.
-        mesh: the cloth.
-        held: [H] vertices.
-        places: [T, H, 3] m, where these are.
+        episode: clouds and first shape.
+        mesh: of the cloth.
+        gripped: [H] vertices.
+        gripped_positions: [T, H, 3] m, their positions.
         noise: standard deviation of a point [m].
+
+    Returns:
+        [T, V, 3] m.
     """
-    faces, found = torch.as_tensor(mesh.faces), [episode.initial]
-    prior = ShapePrior(mesh, episode.initial, STRAIN)
+    faces, frames_so_far = torch.as_tensor(mesh.faces), [episode.initial]
+    prior = ShapePrior(mesh, episode.initial, EDGE_STRAIN_STD)
     for t, cloud in enumerate(episode.clouds[1:], 1):
-        x = 2 * found[-1] - found[-2] if t > 1 else found[-1].clone()
-        for _ in range(ROUNDS):
-            grip = expand_to_axes(held[:, None], x.new_ones(len(held), 1) / FAST, (places[t] - x[held]) / FAST)
+        x = 2 * frames_so_far[-1] - frames_so_far[-2] if t > 1 else frames_so_far[-1].clone()
+        for _ in range(MATCHING_ROUNDS):
+            grip = expand_to_axes(
+                gripped[:, None],
+                x.new_ones(len(gripped), 1) / GRIP_STD_M,
+                (gripped_positions[t] - x[gripped]) / GRIP_STD_M,
+            )
             x = x + solve_moves([*_pulls(x, cloud, faces, noise), *grip, *prior.equations(x)], len(x))
-        found.append(x)
-    return torch.stack(found)
+        frames_so_far.append(x)
+    return torch.stack(frames_so_far)
 
 
 def _pulls(x: Tensor, cloud: Tensor, faces: Tensor, noise: float) -> list[Equations]:
@@ -55,11 +64,16 @@ def _pulls(x: Tensor, cloud: Tensor, faces: Tensor, noise: float) -> list[Equati
     normal = torch.nn.functional.normalize(torch.linalg.cross(b - a, c - a), dim=-1)
     offset = cloud - hits.interpolate(x)
     along = (offset * normal).sum(-1)
-    beside = (offset - along[:, None] * normal)[hits.is_beyond_edge]
-    size = beside.norm(dim=-1).clamp(min=1e-12)
-    rim = hits.corners[hits.is_beyond_edge], hits.weights[hits.is_beyond_edge], beside / size[:, None], size
+    tangential = (offset - along[:, None] * normal)[hits.is_beyond_edge]
+    size = tangential.norm(dim=-1).clamp(min=1e-12)
+    boundary_rows = (
+        hits.corners[hits.is_beyond_edge],
+        hits.weights[hits.is_beyond_edge],
+        tangential / size[:, None],
+        size,
+    )
     out = []
-    for corners, weights, direction, value in ((hits.corners, hits.weights, normal, along), rim):
+    for corners, weights, direction, value in ((hits.corners, hits.weights, normal, along), boundary_rows):
         coefficients = weights[:, :, None] * direction[:, None] / noise
         z = value / noise
         out.append(Equations(corners, coefficients, z).weighted(2.5 / z.abs().clamp(min=2.5)))

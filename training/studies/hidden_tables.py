@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from . import hidden_rates
-from .fabric_tables import NOTHING, table
+from .fabric_tables import NO_VALUE, make_table
 from .hidden_rates import Mark, Rate, further, marks
 from .hidden_scores import NULLS
 
@@ -65,7 +65,7 @@ def rounds_csv(rounds: Mapping[str, Sequence[Mapping[str, Any]]]) -> str:
 
 def by_effect(cases: Sequence[Mapping[str, Any]]) -> str:
     """Markdown with the singles of each effect."""
-    said = lambda r: f"{r.hits} of {r.of}" if r.of else NOTHING  # noqa: E731
+    said = lambda r: f"{r.hits} of {r.of}" if r.of else NO_VALUE  # noqa: E731
     rows = [(name, *map(said, rates)) for name, rates in hidden_rates.by_effect(cases).items()]
     return _lines(("one effect, class identified", "half its typical size", "typical", "1.5", "of all that show"), rows)
 
@@ -108,14 +108,14 @@ def _rate(label: str, value: Rate | float | None) -> tuple[str, ...]:
 def _value(value: Rate | float | None, count: bool = False) -> tuple[str, str, str]:
     """(point, bounds, number of cases)."""
     if isinstance(value, Rate):
-        bounds = NOTHING if value.bounds is None else "{}–{}".format(*map(percent, value.bounds))
+        bounds = NO_VALUE if value.bounds is None else "{}–{}".format(*map(percent, value.bounds))
         return percent(value.share), bounds, str(value.of)
-    return (NOTHING if value is None else f"{value:.2f}" if count else percent(value)), "", ""
+    return (NO_VALUE if value is None else f"{value:.2f}" if count else percent(value)), "", ""
 
 
 def percent(share: float | None) -> str:
     """Whole per cents."""
-    return NOTHING if share is None else f"{100 * share:.0f} %"
+    return NO_VALUE if share is None else f"{100 * share:.0f} %"
 
 
 CASE = ("case", "family", "kind", "hidden", "verdict", "named", "", "amplitude", "gain", "s")
@@ -124,16 +124,16 @@ CASE = ("case", "family", "kind", "hidden", "verdict", "named", "", "amplitude",
 def _case(c: Mapping[str, Any]) -> tuple[str, ...]:
     off = [f"{100 * a['error']:+.0f} %" for a in c.get("amplitudes", ()) if a is not None]
     gain = "" if c.get("gain") is None else f"{c['gain']:.2f}"
-    named = ", ".join(c["named"]) or NOTHING
+    named = ", ".join(c["named"]) or NO_VALUE
     said = "right" if c["right"] else "alarm" if c["family"] in NULLS and c["named"] else "missed"
     said += ", false cause" if c["wrong"] and said != "alarm" else ""
-    hidden = ", ".join(c["hidden"]) or NOTHING
+    hidden = ", ".join(c["hidden"]) or NO_VALUE
     first = (c["name"], c["family"], c["kind"], hidden, c["verdict"], named, said)
-    return (*first, ", ".join(off), gain, NOTHING if c["seconds"] is None else f"{c['seconds']:.0f}")
+    return (*first, ", ".join(off), gain, NO_VALUE if c["seconds"] is None else f"{c['seconds']:.0f}")
 
 
 def _filled(title: str, headings: Sequence[str], rows: Sequence[Sequence[str]], left: int = 1):
-    out = table(title, *headings, left=left)
+    out = make_table(title, *headings, left=left)
     for column in out.columns:
         column.no_wrap = False
     for row in rows:

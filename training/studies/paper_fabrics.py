@@ -1,6 +1,6 @@
-"""The DiffCP paper's tables of fabrics (Zheng et al.): mean parameters, whose units it does not state, and their CoV.
+"""Tables of fabrics in the DiffCP paper (Zheng et al.): coefficients of variation of the parameters.
 
-The means are in ``materials.presets``, read as kPa at a thickness of 1 mm.
+The mean parameters, whose units the paper does not state, are in ``materials.presets``, read as kPa at 1 mm thickness.
 """
 
 from __future__ import annotations

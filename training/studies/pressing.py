@@ -1,7 +1,7 @@
-"""Two layers pressed between plates and slid over each other: what shows contact stiffness, shear stiffness and c_F.
+"""Two layers pressed between plates and slid over each other, to measure contact stiffness, shear stiffness and c_F.
 
-The plates are rough: each holds one whole layer, so that nothing moves freely. The contact is without damping; nothing
-then depends on the rate, and the experiment is run faster than a machine would.
+The plates are rough: each holds one whole layer, so nothing moves freely. The contact has no damping, so nothing
+depends on the rate. The experiment is therefore run faster than on a machine.
 """
 
 from __future__ import annotations
@@ -16,18 +16,19 @@ import torchcloth as tc
 from torchcloth import recordings as rec
 from torchcloth.robots import replay  # pyright: ignore[reportMissingImports] - mapped from robots/ at installation
 
-from .synthetic_sheets import readings
+from .synthetic_sheets import simulate_readings
 
-SIDE = 0.05  # m
-APART, PRESSED, SLIDE = 2.2, 0.8, 0.4  # grid spacings: between the plates at first and at last, and sideways
-DURATION = 0.016  # s: a third pressed, then slid
-FRAMES = 25  # positions of the plates at which forces are read
-FORCE_NOISE = 0.05  # N
-STEP = 0.6  # of the stable one, in the truth
+LAYER_SIDE_M = 0.05
+INITIAL_DISTANCE_SPACINGS, PRESSED_DISTANCE_SPACINGS = 2.2, 0.8  # of the plates, in grid spacings
+SLIDE_SPACINGS = 0.4  # sideways motion of the upper plate, in grid spacings
+DURATION_S = 0.016  # a third for pressing, then sliding
+FORCE_SAMPLES = 25
+FORCE_NOISE_N = 0.05
+STEP_FRACTION = 0.6  # of the stable step, in the truth
 
 
 class Layer(NamedTuple):
-    """SI units; moduli are as in ``AEP``."""
+    """Parameters of a layer in SI units; see ``AEP``."""
 
     youngs_modulus: float
     poisson_ratio: float
@@ -39,17 +40,23 @@ class Layer(NamedTuple):
 
 
 class Plates(NamedTuple):
-    """How the experiment is made."""
+    """Discretisation of the experiment.
 
-    cells: int  # along a side
-    spacing: float  # m, of the contact's grid
-    offset: tuple[float, float, float] = (0.0, 0.0, 0.0)  # m: where the plates are in the grid
+    Attributes:
+        cells: along a side.
+        spacing: of the contact grid [m].
+        offset: position of the plates in the grid [m].
+    """
+
+    cells: int
+    spacing: float
+    offset: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
 
-def stack(layer: Layer, plates: Plates) -> tc.Cloth:
-    """Two layers, each held by a plate in all its vertices."""
-    sheet = tc.meshes.rectangle(SIDE, SIDE, resolution=(plates.cells + 1, plates.cells + 1))
-    count, up = len(sheet.vertices), np.array([0.0, 0.0, APART * plates.spacing])
+def build_layers(layer: Layer, plates: Plates) -> tc.Cloth:
+    """Build two layers, each held by a plate at all its vertices."""
+    sheet = tc.meshes.rectangle(LAYER_SIDE_M, LAYER_SIDE_M, resolution=(plates.cells + 1, plates.cells + 1))
+    count, up = len(sheet.vertices), np.array([0.0, 0.0, INITIAL_DISTANCE_SPACINGS * plates.spacing])
     mesh = tc.meshes.Mesh.build(
         np.concatenate([sheet.vertices, sheet.vertices + up]) + plates.offset,
         np.concatenate([sheet.faces, sheet.faces + count]),
@@ -59,22 +66,26 @@ def stack(layer: Layer, plates: Plates) -> tc.Cloth:
     return tc.Cloth(mesh, material, layer.density, {}, grasps, tc.Contact(plates.spacing, damping=0.0))
 
 
-def motion(plates: Plates) -> dict[str, rec.GripperMotion]:
-    """The upper plate comes down, then slides along x; the lower one is still."""
-    t = np.linspace(0.0, DURATION, 4 * (FRAMES - 1) + 1)
-    down, aside = (0.5 * (1 - np.cos(np.pi * np.clip(s, 0, 1))) for s in (3 * t / DURATION, 1.5 * t / DURATION - 0.5))
+def plate_motion(plates: Plates) -> dict[str, rec.GripperMotion]:
+    """Return the paths of the plates: the upper one comes down, then slides along x; the lower one stands still."""
+    t = np.linspace(0.0, DURATION_S, 4 * (FORCE_SAMPLES - 1) + 1)
+    down, aside = (
+        0.5 * (1 - np.cos(np.pi * np.clip(s, 0, 1))) for s in (3 * t / DURATION_S, 1.5 * t / DURATION_S - 0.5)
+    )
     above = np.zeros((len(t), 3))
-    above[:, 2] = (APART + (PRESSED - APART) * down) * plates.spacing
-    above[:, 0] = SLIDE * aside * plates.spacing
+    above[:, 2] = (
+        INITIAL_DISTANCE_SPACINGS + (PRESSED_DISTANCE_SPACINGS - INITIAL_DISTANCE_SPACINGS) * down
+    ) * plates.spacing
+    above[:, 0] = SLIDE_SPACINGS * aside * plates.spacing
     facing, closed = np.tile([1.0, 0, 0, 0], (len(t), 1)), np.ones(len(t), bool)
     paths = {"below": np.zeros((len(t), 3)), "above": above}
     return {name: rec.GripperMotion(t, x + plates.offset, facing, closed) for name, x in paths.items()}
 
 
 def record(layer: Layer, plates: Plates, seed: int) -> rec.Recording:
-    """The experiment as a recording without cloth."""
+    """Simulate the experiment and return a recording without cloth."""
     rng = np.random.default_rng(seed)
-    cloth, paths = stack(layer, plates), motion(plates)
+    cloth, paths = build_layers(layer, plates), plate_motion(plates)
     recording = rec.Recording(
         cloth=rec.ClothInfo(areal_density=layer.density),
         provenance="synthetic: torchcloth, the same law on another mesh, with another step",
@@ -82,21 +93,23 @@ def record(layer: Layer, plates: Plates, seed: int) -> rec.Recording:
     )
     knots = paths["above"].t
     with torch.no_grad():
-        out = cloth(cloth.rest_state(), replay(recording), knots.tolist(), dt=STEP * cloth.stable_step())
-    felt = {
-        name: replace(m, force=readings(out, name, knots, FORCE_NOISE, rng), position=m.position - plates.offset)
+        out = cloth(cloth.rest_state(), replay(recording), knots.tolist(), dt=STEP_FRACTION * cloth.stable_step())
+    measured = {
+        name: replace(
+            m, force=simulate_readings(out, name, knots, FORCE_NOISE_N, rng), position=m.position - plates.offset
+        )
         for name, m in paths.items()
     }
-    return replace(recording, grippers=felt)
+    return replace(recording, grippers=measured)
 
 
-def on_model(recording: rec.Recording, cloth: tc.Cloth) -> rec.Recording:
-    """The recording for a model: its mesh, and where the camera saw the layers' corners, which gives the frames."""
+def place_on_model(recording: rec.Recording, cloth: tc.Cloth) -> rec.Recording:
+    """Return the recording with a model's mesh and one observed corner, whose times define the frames."""
     t = recording.grippers["above"].t[::4]
     count = len(cloth.mesh.vertices) // 2
     corner = int(np.argmin(cloth.mesh.vertices[count:, :2].sum(1))) + count
     moved = recording.grippers["above"].position[::4] - recording.grippers["above"].position[0]
-    seen = cloth.mesh.vertices[corner] + moved
+    corner_path = cloth.mesh.vertices[corner] + moved
     info = replace(recording.cloth, vertices=cloth.mesh.vertices, faces=cloth.mesh.faces, thickness=1e-3)
-    points = rec.PointClouds(t, seen, np.ones(len(t), int))
+    points = rec.PointClouds(t, corner_path, np.ones(len(t), int))
     return replace(recording, cloth=info, points=points, observation_noise_std=1e-3)

@@ -1,8 +1,8 @@
-"""Planned motions carried out in another engine: does the cloth end at the goal, and what is a fitted fabric worth?
+"""Planned motions executed in another engine: does the cloth end at the goal, and what does a fitted fabric gain?
 
-MuJoCo moves a sheet along a path that nobody is told; a depth camera's last points are the goal. From another motion,
-``torchcloth plan`` finds a path to there with the fabric's fitted values, and with those of a data sheet that is wrong.
-MuJoCo carries both out.
+MuJoCo moves a sheet along a hidden path; the last points of a depth camera are the goal. From another motion,
+``torchcloth plan`` finds a path to the goal, with fitted values of the fabric and with those of a wrong data sheet.
+MuJoCo executes both.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from torchcloth.planning import Goal
 from torchcloth.recordings import Recording
 from torchcloth.robots import replay  # pyright: ignore[reportMissingImports] - mapped from robots/ at installation
 
-from ..resumable import ResumableStudy, check_jobs
+from ..resumable import ResumableStudy, check_jobs, write_result
 from ..validation.independent import motions
 from ..validation.independent.effects import add_effect
 from ..validation.independent.flex_sheet import sheet_mesh
@@ -34,14 +34,14 @@ from ..validation.independent.generate import make_recording
 from ..validation.independent.scene import Scene as IndependentScene
 from ..validation.independent.scene import simulate
 from ..validation.independent.sensor import sample_points
-from .manipulations.console_tables import heading_table, mm, show, write
+from .manipulations.console_tables import heading_table, mm, show
 
 FIT_CASE = "fit"
-FIT_MOTIONS = ("stretch", "swing")  # motions that the fabric is fitted to
-NOMINAL_FACTORS = {"membrane_stiffness": 3.0, "bending_stiffness": 0.4}  # times the truth, on the data sheet
+FIT_MOTIONS = ("stretch", "swing")  # to which the fabric is fitted
+NOMINAL_FACTORS = {"membrane_stiffness": 3.0, "bending_stiffness": 0.4}  # nominal over true value
 TRUE_DRAG_COEFFICIENT = 1.2
-GOAL_SHIFT_M = 0.08  # m, of the hidden path's end from the known one's, along each axis
-GOAL_TURN_RAD = 0.3  # rad about the vertical, likewise of the hands
+GOAL_SHIFT_M = 0.08  # largest shift of the hidden path's end along each axis
+GOAL_TURN_RAD = 0.3  # largest turn of the hands about the vertical
 PLAN_OPTIONS: dict[str, dict[str, Any]] = {
     "fitted": {},
     "data sheet": {},
@@ -51,31 +51,43 @@ PLAN_OPTIONS: dict[str, dict[str, Any]] = {
 
 @dataclass(frozen=True)
 class Scale:
-    """How much is done."""
+    """Size of the study.
+
+    Attributes:
+        motions: names.
+        nodes: along each side of the true mesh.
+        fit_nodes: along each side of the model's mesh.
+        iterations: of Gauss-Newton in the plan.
+    """
 
     motions: tuple[str, ...] = ("swing", "swing-fast", "turn", "lift", "drag")
-    nodes: int = 25  # along each side of the truth's mesh
+    nodes: int = 25
     fit_nodes: int = 17
-    iterations: int = 12  # of the plan's Gauss-Newton
+    iterations: int = 12
 
 
 FAST_SCALE = Scale(motions=("swing-fast",), nodes=13, fit_nodes=9, iterations=5)
 
 
 class Scene(NamedTuple):
-    """Another engine's cloth, and what is said of it."""
+    """A cloth of the other engine.
+
+    Attributes:
+        true: with the true values.
+        stated: with the values of the data sheet.
+    """
 
     true: Any
-    stated: Any  # whose values the data sheet has
+    stated: Any
 
 
 def add(parser: argparse.ArgumentParser) -> None:
-    """Options."""
-    parser.add_argument("--jobs", type=int, default=1, metavar="N", help="cases at a time (1)")
+    """Add the study's options."""
+    parser.add_argument("--jobs", type=int, default=1, metavar="N", help="cases at a time (default: 1)")
 
 
 def run(options: argparse.Namespace) -> None:
-    """Fit the fabric, then every case; print and write reach.json."""
+    """Fit the fabric, compute the cases, print and write reach.json."""
     check_jobs(options.jobs)
     scale = FAST_SCALE if options.fast else Scale()
     study = ResumableStudy(options.out, {"study": "reach", **asdict(scale)})
@@ -85,23 +97,25 @@ def run(options: argparse.Namespace) -> None:
     cases = {f"{k}-{name}": partial(plan_and_execute, scale, k, name, folder) for k, name in enumerate(scale.motions)}
     results |= study.run(cases, options.jobs)
     show(_table(results), TABLE_NOTE)
-    write(options.out / "reach.json", results)
+    write_result(options.out / "reach.json", "reach", results)
 
 
 def build_scenes(scale: Scale) -> Scene:
-    """A knit in air, and the same with what a wrong data sheet says of it."""
+    """Build a knit in air, with true values and with those of a wrong data sheet."""
     make = IndependentScene()
     true = replace(make, sheet=replace(make.sheet, nodes=(scale.nodes, scale.nodes)))
     stated = replace(
         true,
-        sheet=replace(true.sheet, membrane_stiffness=NOMINAL_FACTORS["membrane_stiffness"] * true.sheet.membrane_stiffness),
+        sheet=replace(
+            true.sheet, membrane_stiffness=NOMINAL_FACTORS["membrane_stiffness"] * true.sheet.membrane_stiffness
+        ),
         plate=replace(true.plate, stiffness=NOMINAL_FACTORS["bending_stiffness"] * true.plate.stiffness),
     )
     return Scene(add_effect(true, "air.drag_n", TRUE_DRAG_COEFFICIENT, {}), stated)
 
 
 def fit_fabric(scale: Scale, folder: Path) -> dict[str, Any]:
-    """The fabric, from two motions."""
+    """Fit the fabric to two motions."""
     torch.set_default_dtype(torch.float64)
     recordings = [_recorded(scale, name, k)[0] for k, name in enumerate(FIT_MOTIONS)]
     fit = identify(build_cloth(recordings[0]), recordings, nuisances=["grasp"])
@@ -110,7 +124,7 @@ def fit_fabric(scale: Scale, folder: Path) -> dict[str, Any]:
 
 
 def plan_and_execute(scale: Scale, number: int, name: str, folder: Path) -> dict[str, Any]:
-    """One goal: how far the cloth is from it as recorded, as planned, and when the plan is carried out."""
+    """Plan and execute a motion to one goal; return distances as recorded, as planned and as executed."""
     torch.set_default_dtype(torch.float64)
     episode, motion, recorded_result = _recorded(scale, name, 10 + number)
     cloth = build_scenes(scale).true
@@ -121,10 +135,15 @@ def plan_and_execute(scale: Scale, number: int, name: str, folder: Path) -> dict
     faces = torch.as_tensor(sheet_mesh(cloth.sheet)[1])
     out: dict[str, Any] = {
         "noise": _from_goal(goal, goal_result.x[-1], faces),
-        "recorded": _from_goal(goal, recorded_result.x[-1], faces) | {"vertices": _rms(recorded_result.x[-1], goal_result.x[-1])},
+        "recorded": _from_goal(goal, recorded_result.x[-1], faces)
+        | {"vertices": _rms(recorded_result.x[-1], goal_result.x[-1])},
     }
     for label, how in PLAN_OPTIONS.items():
-        model = build_cloth(episode) if label == "data sheet" else load_fitted_cloth(folder / IDENTIFICATION_FILE_NAME, episode)[0]
+        model = (
+            build_cloth(episode)
+            if label == "data sheet"
+            else load_fitted_cloth(folder / IDENTIFICATION_FILE_NAME, episode)[0]
+        )
         began = time.perf_counter()
         results = planning.plan(model, episode, goal, **({"iterations": scale.iterations, "wait": 0.0} | how))
         executed = simulate(cloth, _planned_motion(motion, results.recording))
@@ -133,7 +152,7 @@ def plan_and_execute(scale: Scale, number: int, name: str, folder: Path) -> dict
             "expected": results.distance_after[0],
             **_from_goal(goal, executed.x[-1], faces),
             "vertices": _rms(executed.x[-1], goal_result.x[-1]),
-            "looks": len(results.distance_history),
+            "motions_tried": len(results.distance_history),
             "seconds": time.perf_counter() - began,
             "limit": results.nearest_limit,
         }
@@ -141,7 +160,7 @@ def plan_and_execute(scale: Scale, number: int, name: str, folder: Path) -> dict
 
 
 def _recorded(scale: Scale, name: str, seed: int) -> tuple[Recording, Any, Any]:
-    """(recording, motion, what happened) of a motion by name."""
+    """Return the recording, the motion and the simulated result of a motion by name."""
     cloth = build_scenes(scale)
     motion = motions.make_motion(name, cloth.true.sheet)
     result = simulate(cloth.true, motion)
@@ -150,7 +169,7 @@ def _recorded(scale: Scale, name: str, seed: int) -> tuple[Recording, Any, Any]:
 
 
 def _shift_end(motion: Any, rng: np.random.Generator) -> Any:
-    """The motion with its end elsewhere: both hands shifted and turned about the vertical, ever more on the way."""
+    """Return the motion with another end: both hands are gradually shifted and turned about the vertical."""
     jerk = motions.minimum_jerk
     t = motion.t
     share = jerk(t, np.array([t[0] + 0.2, t[-1] - 0.2]), np.array([0.0, 1.0]))
@@ -168,7 +187,7 @@ def _shift_end(motion: Any, rng: np.random.Generator) -> Any:
 
 
 def _planned_motion(motion: Any, planned: Recording) -> Any:
-    """The planned paths as another engine takes them."""
+    """Return the planned paths for the other engine."""
     paths = replay(planned)
     t = next(iter(paths.values())).t.numpy()
     return replace(motion, t=t, pose={name: paths[name].pose.numpy() for name in motion.pose})
@@ -183,15 +202,15 @@ def _rms(x: np.ndarray, y: np.ndarray) -> float:
 
 
 TABLE_NOTE = (
-    "distance: of the goal's points, which carry the sensor's noise, from the cloth at the end (one-sided Chamfer); "
-    "expected: as the plan's own simulation has it; done: as MuJoCo does it. vertices: root mean square of where every "
-    "piece of cloth is, beside where the hidden path brought it."
+    "distance: of the goal's points, with sensor noise, from the cloth at the end (one-sided Chamfer). expected: in the "
+    "simulation of the plan. executed: in MuJoCo. vertices: root mean square distance of all vertices from their places "
+    "after the hidden path."
 )
 
 
 def _table(results: dict[str, Any]):
     title = "Distance from the goal [mm]"
-    table = heading_table(title, "motion", "planned with", "expected", "done", "vertices", "motions tried")
+    table = heading_table(title, "motion", "planned with", "expected", "executed", "vertices", "motions tried")
     for name, case in results.items():
         if name == FIT_CASE:
             continue
@@ -201,7 +220,7 @@ def _table(results: dict[str, Any]):
             entry = case[label]
             cells = [mm(entry[key]) for key in ("expected", "distance", "vertices")]
             stated = "fitted, by Adam" if label == "adam" else label
-            table.add_row("", stated, *cells, str(entry["looks"]))
+            table.add_row("", stated, *cells, str(entry["motions_tried"]))
         table.add_row(
             "", "the hidden path itself", "", mm(case["noise"]["distance"]), mm(0.0), "", "", end_section=True
         )

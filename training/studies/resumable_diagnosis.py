@@ -1,4 +1,4 @@
-"""A diagnosis as the command does it, for a study: its report stays in a folder, and a stopped one goes on."""
+"""Resumable diagnosis for a study, as the command ``torchcloth diagnose`` runs it."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ def diagnosis_in(
     model: WorldModel | None = None,
     hypotheses: Sequence[Hypothesis] | None = None,
 ) -> Diagnosis:
-    """The answer, written to the folder; arguments and errors as in ``diagnose``."""
+    """Run a diagnosis, resuming a stopped one, and write it to the folder; see ``diagnose`` for arguments and errors."""
     journal = folder / PROGRESS_FOLDER_NAME
     answer = diagnose(recordings, model, hypotheses, journal=journal, resume=journal.exists())
     write_diagnosis(answer, recordings, folder)

@@ -9,13 +9,11 @@ counts the causes that are called present.
 from __future__ import annotations
 
 import argparse
-import json
 from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
 
-from torchcloth._utils.files import write_text
 from torchcloth.diagnosis import (
     ModelFit,
     build_base_model,
@@ -31,7 +29,7 @@ from torchcloth.errors import InvalidInput
 from torchcloth.recordings import read
 from torchcloth.recordings.consistency import merge_scene
 
-from ..resumable import ResumableStudy, check_jobs
+from ..resumable import ResumableStudy, check_jobs, write_result
 from ..validation.hidden import case_sampling, make_case, reveal_truth
 from .fabric_tables import NO_VALUE, make_table
 from .screening_ablations import ABLATIONS, with_fixed_parameters, with_tangent_slopes
@@ -51,11 +49,11 @@ def run(options: argparse.Namespace) -> None:
     """Compute the missing cases, then print and write screening.json."""
     check_jobs(options.jobs)
     seeds = (*NULL_SEEDS[:1], *SINGLE_CAUSE_SEEDS[:1]) if options.fast else (*NULL_SEEDS, *SINGLE_CAUSE_SEEDS)
-    study = ResumableStudy(options.out, {"study": "parts", "fast": options.fast})
+    study = ResumableStudy(options.out, {"study": "screening", "fast": options.fast})
     study.start()
     work = {str(seed): partial(screen_case, options.out, seed, options.fast) for seed in seeds}
     results = list(study.run(work, options.jobs).values())
-    path = write_text(options.out / "parts.json", json.dumps(results, indent=1, allow_nan=False) + "\n")
+    path = write_result(options.out / "screening.json", "screening", {"cases": results})
     show(results)
     print(f"result: {path}")
 
@@ -65,10 +63,14 @@ def screen_case(out: Path, seed: int, fast: bool) -> dict[str, Any]:
     episodes = out / "episodes" / str(seed)
     how = ["--fast"] if fast else ["--nodes", str(TRUTH_NODES)]
     if make_case.main(["--seed", str(seed), "--out", str(episodes), *how]):
-        raise InvalidInput("studies parts", got=f"case {seed} that could not be made", expected="its episodes")
-    episode_folders = sorted(path for path in episodes.iterdir() if not path.name.startswith("."))  # hidden folders are left by a stopped run
+        raise InvalidInput("studies screening", got=f"case {seed} that could not be made", expected="its episodes")
+    episode_folders = sorted(
+        path for path in episodes.iterdir() if not path.name.startswith(".")
+    )  # hidden folders are left by a stopped run
     recordings = [read(path) for path in episode_folders]
-    truth = reveal_truth.reveal_truth(case_sampling.draw_case(seed, case_sampling.FAST_SIZE if fast else case_sampling.ROUND_SIZE))
+    truth = reveal_truth.reveal_truth(
+        case_sampling.draw_case(seed, case_sampling.FAST_SIZE if fast else case_sampling.ROUND_SIZE)
+    )
     hidden = [e for e in truth["effects"] if e["typical_fraction"] >= case_sampling.HALF_SIZE]
     rows_by_way = {name: [_screening_row(row) for row in screen(fit)] for name, fit in _fits_by_way(recordings).items()}
     return {"seed": seed, "family": truth["family"], "hidden": hidden, "ways": rows_by_way}

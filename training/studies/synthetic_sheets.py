@@ -1,4 +1,4 @@
-"""What synthetic recordings of sheets share: material points on a grid of vertices, and force readings."""
+"""Functions for synthetic recordings of sheets: material points on a grid of vertices, and force readings."""
 
 from __future__ import annotations
 
@@ -7,13 +7,13 @@ import numpy as np
 from torchcloth.types import Rollout
 
 
-def on_grid(x: np.ndarray, resolution: tuple[int, int], share: np.ndarray) -> np.ndarray:
-    """Positions [N, 3] m of material points, bilinear between the vertices of ``meshes.rectangle``.
+def interpolate_on_grid(x: np.ndarray, resolution: tuple[int, int], share: np.ndarray) -> np.ndarray:
+    """Interpolate positions [N, 3] m of material points bilinearly between the vertices of ``meshes.rectangle``.
 
     Args:
         x: [V, 3] m.
-        resolution: vertices along width and height.
-        share: [N, 2], of width and height, 0 to 1.
+        resolution: number of vertices along width and height.
+        share: [N, 2], fractions of width and height, 0 to 1.
     """
     columns, rows = resolution
     place = np.clip(share, 0, 1) * [columns - 1, rows - 1]
@@ -24,12 +24,12 @@ def on_grid(x: np.ndarray, resolution: tuple[int, int], share: np.ndarray) -> np
     return (1 - a) * low + a * high
 
 
-def readings(
+def simulate_readings(
     out: Rollout, name: str, knots: np.ndarray, noise: float, rng: np.random.Generator, axes: int = 3
 ) -> np.ndarray:
-    """[K, axes] N (and N m) that a sensor in a gripper reads at its knots [s], with white noise.
+    """Simulate readings [K, axes] N (and N m) of a gripper's sensor at its knots [s], with white noise.
 
-    A rollout gives means over intervals, so readings lie between their middles.
+    A rollout gives means over intervals, so readings are interpolated between the middles of intervals.
     """
     times, mean = out.t.numpy(), out.wrench[name][1:, :axes].numpy()
     middle = 0.5 * (times[1:] + times[:-1])

@@ -1,1 +1,1 @@
-"""Three garments, ten manipulations each: the cases that the studies garments, chamfer and factors share."""
+"""Cases of the studies garments, chamfer and factors: three garments with ten manipulations each."""

@@ -1,4 +1,4 @@
-"""A manipulation as a recording: simulated on one discretisation, seen by a depth camera, given on another."""
+"""Recording of a manipulation: simulated on one discretisation, observed by a depth camera, given on another."""
 
 from __future__ import annotations
 
@@ -12,73 +12,84 @@ from torch import Tensor
 from torchcloth import recordings as rec
 from torchcloth.errors import SimulationDiverged
 from torchcloth.losses import find_closest_points
-from torchcloth.observe import DepthCamera, DepthNoise, View, capture, look_at, render_depth, build_solid_mesh
+from torchcloth.observe import DepthCamera, DepthNoise, View, build_solid_mesh, capture, look_at, render_depth
 from torchcloth.robots import to_gripper_motion  # pyright: ignore[reportMissingImports] - mapped from robots/
 from torchcloth.synthesis.garments import DEFAULT_AREAL_DENSITY_KG_PER_M2
+from torchcloth.synthesis.generate import MIN_CLOUD_POINTS, SETTLING_TIME_S
 from torchcloth.synthesis.sensors import CAMERA_POSITION_M, CAMERA_TARGET_M
 from torchcloth.types import Trajectory
 
 from .scenes import INITIAL_LAYER_DISTANCE_M, Fabric, Manipulation, Scene
 
-SETTLING_TIME_S = 0.6  # s, in which hanging cloth comes to rest before the first frame
-MIN_CLOUD_POINTS = 10  # points; a frame with fewer is left out
-POLE_SIZE_M = (0.045, 0.02, 1.2)  # m, a box that stands in the camera's way
+POLE_SIZE_M = (0.045, 0.02, 1.2)  # a box that occludes the camera's view
 POLE_POSITION_FRACTION = 0.55  # of the way from the target to the camera
 
 
-class Seen(NamedTuple):
-    """What a fit gets, and what it is judged by."""
+class Observation(NamedTuple):
+    """Data of a fit, and the truth for its assessment.
+
+    Attributes:
+        recording: data.
+        x: [T, V, 3] m, the truth at the fit's vertices and at the frames of the points.
+        hidden: fraction of the visible cloth that is occluded.
+    """
 
     recording: rec.Recording
-    x: Tensor  # [T, V, 3] m, the truth at the fit's vertices, at the frames of the points
-    hidden: float  # share of the visible cloth that something stands before
+    x: Tensor
+    hidden: float
 
-    def until(self, share: float) -> Seen:
-        """The first ``share`` of the frames."""
+    def until(self, share: float) -> Observation:
+        """Return the first frames, a fraction ``share`` of all."""
         points = self.recording.require("points")
         count = round(share * len(points.t))
-        beginning = points.only(np.arange(len(points)) < count)
+        beginning = points.select(np.arange(len(points)) < count)
         return self._replace(recording=replace(self.recording, points=beginning), x=self.x[:count])
 
 
-def record(truth: Scene, model: Scene, rate: float, points: int) -> Seen:
-    """Simulate the true fabric on ``truth``'s discretisation and look at it; the fit will use ``model``'s.
+def record(truth: Scene, model: Scene, rate: float, points: int) -> Observation:
+    """Simulate and observe the true fabric on the truth's discretisation, for a fit on the model's.
 
     Raises:
-        SimulationDiverged: the cloth ran away.
+        SimulationDiverged: the simulation is unstable.
     """
     what = truth.what
     motion = {name: Trajectory(t, pose.double(), closed) for name, (t, pose, closed) in truth.action.motion.items()}
     end = min(float(path.t[-1]) for path in motion.values())
     t = np.arange(int(end * rate + 1e-6) + 1) / rate
     x = _simulate(truth, motion, t)
-    clouds, sigma, hidden = _look(what, x, truth.mesh.faces, points)
-    study = [i for i, cloud in enumerate(clouds) if i == 0 or len(cloud) >= MIN_CLOUD_POINTS]
-    place = find_closest_points(torch.as_tensor(model.rest), torch.as_tensor(truth.rest), torch.as_tensor(truth.mesh.faces))
-    own = place.interpolate(torch.as_tensor(x[study]))
+    clouds, stds, hidden = _look(what, x, truth.mesh.faces, points)
+    kept_frames = [i for i, cloud in enumerate(clouds) if i == 0 or len(cloud) >= MIN_CLOUD_POINTS]
+    place = find_closest_points(
+        torch.as_tensor(model.rest), torch.as_tensor(truth.rest), torch.as_tensor(truth.mesh.faces)
+    )
+    true_positions = place.interpolate(torch.as_tensor(x[kept_frames]))
     recording = rec.Recording(
         cloth=rec.ClothInfo(
             areal_density=DEFAULT_AREAL_DENSITY_KG_PER_M2,
             vertices=model.rest,
             faces=model.mesh.faces,
             uv=model.mesh.pattern,
-            initial_vertices=own[0].numpy(),
+            initial_vertices=true_positions[0].numpy(),
         ),
         provenance=f"synthetic: the fitted engine on {truth.fine.triangles} triangles (same law, other discretisation)",
-        grasps={name: rec.GraspInfo(vertices=held) for name, held in model.held.items()},
-        colliders={"table": rec.Collider(np.array([0.0, 0.0, INITIAL_LAYER_DISTANCE_M / 2]), np.array([0.0, 0.0, 1.0]))},
+        grasps={name: rec.GraspInfo(vertices=vertices) for name, vertices in model.gripped_vertices.items()},
+        colliders={
+            "table": rec.Collider(np.array([0.0, 0.0, INITIAL_LAYER_DISTANCE_M / 2]), np.array([0.0, 0.0, 1.0]))
+        },
         points=rec.PointClouds(
-            t[study], np.concatenate([clouds[i] for i in study]), np.array([len(clouds[i]) for i in study])
+            t[kept_frames],
+            np.concatenate([clouds[i] for i in kept_frames]),
+            np.array([len(clouds[i]) for i in kept_frames]),
         ),
-        observation_noise_std=sigma,
+        observation_noise_std=stds,
         grippers={name: to_gripper_motion(path) for name, path in motion.items()},
     )
-    return Seen(recording, own, hidden)
+    return Observation(recording, true_positions, hidden)
 
 
 @torch.no_grad()
 def _simulate(scene: Scene, motion: dict[str, Trajectory], t: np.ndarray) -> np.ndarray:
-    """[T, V, 3] m."""
+    """Return the true vertices [T, V, 3] m."""
     cloth = scene.cloth(Fabric.true(scene.what.garment))
     dt, state = scene.fine.step * cloth.stable_step(), cloth.rest_state()
     if scene.hangs:
@@ -90,24 +101,24 @@ def _simulate(scene: Scene, motion: dict[str, Trajectory], t: np.ndarray) -> np.
 
 
 def _look(what: Manipulation, x: np.ndarray, faces: np.ndarray, points: int) -> tuple[list[np.ndarray], float, float]:
-    """Clouds [N, 3] m of all frames, the mean deviation of a point's depth [m], and the share that the pole hides."""
+    """Return clouds [N, 3] m of all frames, the mean standard deviation of depth [m], and the hidden fraction."""
     rng = np.random.default_rng([sum(map(ord, what.garment)), what.number])
     camera = DepthCamera.azure_kinect_nfov(look_at(np.array(CAMERA_POSITION_M), np.array(CAMERA_TARGET_M)))
     view = View(camera, DepthNoise(), max_points=points).with_bias(rng)
-    pole, clouds, sigma, free = _pole(rng), [], [], []
+    pole, clouds, stds, free = _pole(rng), [], [], []
     for i, frame in enumerate(x):
         cloud = capture(view, frame, faces, [pole], rng=rng).points
         clouds.append(cloud)
         if len(cloud):
-            sigma.append(float(DepthNoise().sigma(camera.project(cloud)[1]).mean()))
+            stds.append(float(DepthNoise().sigma(camera.project(cloud)[1]).mean()))
         if i % 4 == 0:
             open_, shut = (render_depth(camera, [(frame, faces), *more])[1] == 0 for more in ([], [pole]))
             free.append(shut.sum() / max(1, open_.sum()))
-    return clouds, float(np.mean(sigma)), float(1 - np.mean(free))
+    return clouds, float(np.mean(stds)), float(1 - np.mean(free))
 
 
 def _pole(rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-    """Vertices and triangles of an upright box between camera and cloth, somewhat to a side."""
+    """Return vertices and triangles of an upright box between camera and cloth, slightly to a side."""
     eye, target = np.array(CAMERA_POSITION_M), np.array(CAMERA_TARGET_M)
     toward = np.array([eye[0] - target[0], eye[1] - target[1], 0.0])
     toward /= np.linalg.norm(toward)

@@ -1,4 +1,4 @@
-"""Pictures of the three studies."""
+"""Figures of the studies garments, chamfer and factors."""
 
 from __future__ import annotations
 
@@ -9,32 +9,32 @@ from typing import Any
 from torchcloth._utils.files import write_atomically
 
 from . import paper_tables
-from .cases import SOUGHT
+from .cases import PAPER_PARAMETERS
 from .measures import Pooled
-from .scenes import ACTIONS, WORN
+from .scenes import ACTIONS, STUDY_GARMENTS
 
-COLOURS = {"cover": "#1f6f8b", "fling": "#b0653a", "drag": "#3d7f3d"}
-LABELS = {"youngs_modulus": "E", "poisson_ratio": "ν", "contact_stiffness": "k", "shear_stiffness": "γ"}
-WORDS = {"null": "rigid carry", "start": "not fitted", "fit": "fitted"}
-STATES = {"null": "#bbbbbb", "start": "#8fb8c8", "fit": "#1f6f8b"}
+ACTION_COLOURS = {"cover": "#1f6f8b", "fling": "#b0653a", "drag": "#3d7f3d"}
+PARAMETER_SYMBOLS = {"youngs_modulus": "E", "poisson_ratio": "ν", "contact_stiffness": "k", "shear_stiffness": "γ"}
+STATE_LABELS = {"null": "rigid carry", "start": "not fitted", "fit": "fitted"}
+STATE_COLOURS = {"null": "#bbbbbb", "start": "#8fb8c8", "fit": "#1f6f8b"}
 
 
-def estimates(found: dict[str, dict[str, Any]], path: Path) -> None:
-    """Every estimate over its truth with its 95 % interval, by garment; hollow and grey: not identifiable."""
-    cases = [case for case in found.values() if "found" in case]
-    worn = [name for name in WORN if any(c["manipulation"]["garment"] == name for c in cases)]
+def estimates(results: dict[str, dict[str, Any]], path: Path) -> None:
+    """Draw all estimates divided by their truth, with 95 % intervals; hollow and grey if not identifiable."""
+    cases = [case for case in results.values() if "estimates" in case]
+    worn = [name for name in STUDY_GARMENTS if any(c["manipulation"]["garment"] == name for c in cases)]
     if not worn:
         return
-    figure, axes = _figure(len(SOUGHT), 1.6 + 1.0 * len(worn))
-    for axis, name in zip(axes, SOUGHT, strict=True):
+    figure, axes = _figure(len(PAPER_PARAMETERS), 1.6 + 1.0 * len(worn))
+    for axis, name in zip(axes, PAPER_PARAMETERS, strict=True):
         for row, garment in enumerate(worn):
-            own = [c for c in cases if c["manipulation"]["garment"] == garment]
-            for i, case in enumerate(own):
-                _estimate(axis, case, name, row + (0.75 * (i / (len(own) - 1) - 0.5) if len(own) > 1 else 0.0))
+            group = [c for c in cases if c["manipulation"]["garment"] == garment]
+            for i, case in enumerate(group):
+                _estimate(axis, case, name, row + (0.75 * (i / (len(group) - 1) - 0.5) if len(group) > 1 else 0.0))
         axis.axvline(1.0, color="black", linewidth=0.8)
-        axis.set(title=LABELS[name], xscale="log", xlim=(0.05, 20), xlabel="estimate / truth")
+        axis.set(title=PARAMETER_SYMBOLS[name], xscale="log", xlim=(0.05, 20), xlabel="estimate / truth")
         axis.set(yticks=range(len(worn)), ylim=(len(worn) - 0.5, -0.5), yticklabels=worn if axis is axes[0] else [])
-    for action, colour in COLOURS.items():
+    for action, colour in ACTION_COLOURS.items():
         axes[0].plot([], [], "o-", color=colour, label=f"{action}, with 95 % interval")
     axes[0].plot([], [], "o-", color="#bbbbbb", markerfacecolor="none", label="not identifiable")
     figure.legend(fontsize=8, loc="outside lower center", ncols=4)
@@ -42,8 +42,8 @@ def estimates(found: dict[str, dict[str, Any]], path: Path) -> None:
 
 
 def _estimate(axis: Any, case: dict[str, Any], name: str, place: float) -> None:
-    e, truth = case["found"][name], case["truth"][name]
-    colour = COLOURS[case["manipulation"]["action"]] if e["identifiable"] else "#bbbbbb"
+    e, truth = case["estimates"][name], case["truth"][name]
+    colour = ACTION_COLOURS[case["manipulation"]["action"]] if e["identifiable"] else "#bbbbbb"
     low, high = (max(end / truth, 1e-9) for end in e["ci95"])
     axis.plot([low, high], [place, place], "-", color=colour, linewidth=1, zorder=1)
     face = colour if e["identifiable"] else "none"
@@ -51,20 +51,22 @@ def _estimate(axis: Any, case: dict[str, Any], name: str, place: float) -> None:
 
 
 def distances(result: dict[str, dict[str, Any]], path: Path) -> None:
-    """Both Chamfer conventions by action and by garment, with the paper's means; nothing where nothing was finished."""
+    """Draw both Chamfer conventions by action and by garment, with the paper's means."""
     if not any(result.values()):
         return
     figure, axes = _figure(2, 3.8)
-    for axis, (by, names) in zip(axes, (("action", ACTIONS), ("garment", WORN)), strict=True):
+    for axis, (by, names) in zip(axes, (("action", ACTIONS), ("garment", STUDY_GARMENTS)), strict=True):
         rows = {name: result[by][name] for name in names if name in result[by]}
         for i, (name, conventions) in enumerate(rows.items()):
             for j, (convention, hatch) in enumerate((("surface", ""), ("vertices", "//"))):
-                for k, (state, colour) in enumerate(STATES.items()):
-                    label = f"{WORDS[state]}, to {convention}" if i == 0 else None
+                for k, (state, colour) in enumerate(STATE_COLOURS.items()):
+                    label = f"{STATE_LABELS[state]}, to {convention}" if i == 0 else None
                     value = 1e3 * conventions[convention][state]["mean"]
                     place = i + 0.12 * (3 * j + k - 3)
                     axis.bar(place, value, 0.11, color=colour, hatch=hatch, edgecolor="white", label=label)
-            axis.plot(i + 0.43, 1e3 * paper_tables.CHAMFER[name][0], "D", color="#b0653a", label="paper" if i == 0 else None)
+            axis.plot(
+                i + 0.43, 1e3 * paper_tables.CHAMFER[name][0], "D", color="#b0653a", label="paper" if i == 0 else None
+            )
         axis.set(title=f"by {by}", xticks=range(len(rows)), xticklabels=list(rows), yscale="log", ylim=(0.8, 200))
         axis.set(yticks=(1, 3, 10, 30, 100), yticklabels=(1, 3, 10, 30, 100))
         axis.minorticks_off()
@@ -74,14 +76,14 @@ def distances(result: dict[str, dict[str, Any]], path: Path) -> None:
 
 
 def levels(factors: Mapping[str, Pooled], path: Path) -> None:
-    """Mean and standard deviation of the distance at every level; nothing where nothing was finished."""
+    """Draw mean and standard deviation of the distance at each level."""
     if not any(p.levels for p in factors.values()):
         return
     figure, axes = _figure(len(factors), 3.2)
     for axis, (factor, p) in zip(axes, factors.items(), strict=True):
         names = list(p.levels)
-        means = [1e3 * own.mean for own in p.levels.values()]
-        spreads = [1e3 * own.mean * (0.0 if own.count < 2 else own.cov) for own in p.levels.values()]
+        means = [1e3 * group.mean for group in p.levels.values()]
+        spreads = [1e3 * group.mean * (0.0 if group.count < 2 else group.cov) for group in p.levels.values()]
         axis.errorbar(range(len(names)), means, spreads, fmt="o", color="#1f6f8b", capsize=4)
         axis.axhline(1e3 * p.mean, color="#bbbbbb", linewidth=1)
         axis.set(

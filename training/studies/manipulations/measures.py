@@ -1,4 +1,4 @@
-"""Numbers over cases: mean, coefficient of variation, the paper's pooled variance."""
+"""Statistics over cases: mean, coefficient of variation, the paper's pooled variance."""
 
 from __future__ import annotations
 
@@ -10,15 +10,21 @@ import numpy as np
 
 
 class Spread(NamedTuple):
-    """Of one quantity over cases."""
+    """Statistics of one quantity over cases.
+
+    Attributes:
+        mean: of the values.
+        cov: standard deviation over mean; NaN with fewer than two values.
+        count: number of values.
+    """
 
     mean: float
-    cov: float  # standard deviation over mean; NaN with fewer than two
+    cov: float
     count: int
 
 
-def spread(values: Sequence[float]) -> Spread:
-    """Mean and coefficient of variation (of the sample: n - 1); NaN where there is nothing to take them of."""
+def sample_spread(values: Sequence[float]) -> Spread:
+    """Compute mean and coefficient of variation (with n - 1); NaN without values."""
     if not len(values):
         return Spread(math.nan, math.nan, 0)
     mean = float(np.mean(values))
@@ -26,18 +32,25 @@ def spread(values: Sequence[float]) -> Spread:
 
 
 class Pooled(NamedTuple):
-    """Of one quantity over the levels of a factor."""
+    """Statistics of one quantity over the levels of a factor.
 
-    mean: float  # grand mean, of all values
-    pooled: float  # the paper's: variance within the levels plus that between them
-    between: float  # the second part alone: what the factor does
+    Attributes:
+        mean: of all values.
+        pooled_variance: the paper's variance within plus between the levels.
+        between: variance between the levels, the effect of the factor.
+        levels: statistics of each level.
+    """
+
+    mean: float
+    pooled_variance: float
+    between: float
     levels: dict[str, Spread]
 
 
-def pooled(groups: Mapping[str, Sequence[float]]) -> Pooled:
-    """The paper's formula: sum over levels of N_i V_i + N_i (a_i - a)^2, by the number of all values.
+def pooled_variance(groups: Mapping[str, Sequence[float]]) -> Pooled:
+    """Compute the paper's sum over levels of N_i V_i + N_i (a_i - a)^2, divided by the number of all values.
 
-    Its two parts add up to the variance of all values, whatever the levels: only the second knows the factor.
+    Both parts add up to the variance of all values for any levels; only the second one depends on the factor.
     """
     groups = {level: values for level, values in groups.items() if len(values)}
     every = np.concatenate([np.asarray(values, dtype=float) for values in groups.values()]) if groups else np.empty(0)
@@ -46,4 +59,4 @@ def pooled(groups: Mapping[str, Sequence[float]]) -> Pooled:
     mean = float(every.mean())
     within = sum(len(values) * float(np.var(values)) for values in groups.values()) / len(every)
     between = sum(len(values) * (float(np.mean(values)) - mean) ** 2 for values in groups.values()) / len(every)
-    return Pooled(mean, within + between, between, {level: spread(values) for level, values in groups.items()})
+    return Pooled(mean, within + between, between, {level: sample_spread(values) for level, values in groups.items()})

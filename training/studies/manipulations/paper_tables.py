@@ -1,4 +1,4 @@
-"""The paper's garment tables (Zheng et al., DiffCP), as printed there: no units are given for E, k and gamma."""
+"""The paper's garment tables (Zheng et al., DiffCP), as printed there without units of E, k and gamma."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ PARAMETERS = {
     "shear_stiffness": {"dress": (350.88, 18.6), "trousers": (733.46, 16.7), "shirt": (149.43, 24.8)},
 }
 
-# Mean Chamfer distance, CoV [%]; the paper's stop rule, "below 1.5cm", reads its numbers as metres.
+# Mean Chamfer distance and CoV [%]. The paper's stop rule "below 1.5cm" implies metres.
 CHAMFER = {
     "cover": (0.017143, 21.37),
     "drag": (0.016957, 23.16),

@@ -1,4 +1,4 @@
-"""What the three studies share on the command line, and the cases that they run or find."""
+"""Options of the three studies, and the cases that they load or compute."""
 
 from __future__ import annotations
 
@@ -12,56 +12,70 @@ from typing import Any
 from torchcloth.errors import InvalidInput
 
 from ...resumable import ResumableStudy
-from .cases import Setup, solve
-from .scenes import WORN, Manipulation, manipulations
+from .cases import Setup, solve_case
+from .scenes import STUDY_GARMENTS, Manipulation, manipulations
 
-QUICK = {"dress": 0, "trousers": 2, "shirt": 1}  # the legs of trousers always touch: the shortest action for them
-FAST = Setup(triangles=130, gap=0.06, rate=10.0, points=120, iterations=2)
+FAST_NUMBER = {
+    "dress": 0,
+    "trousers": 2,
+    "shirt": 1,
+}  # trousers get the shortest action, because their legs always touch
+FAST_SETUP = Setup(triangles=130, gap=0.06, rate=10.0, points=120, iterations=2)
 
 
 def add(parser: argparse.ArgumentParser) -> None:
-    """Options."""
+    """Add the options that the three studies share."""
     option = parser.add_argument
     option(
-        "--garments", nargs="+", choices=WORN, default=list(WORN), metavar="NAME", help=f"among {', '.join(WORN)} (all)"
+        "--garments",
+        nargs="+",
+        choices=STUDY_GARMENTS,
+        default=list(STUDY_GARMENTS),
+        metavar="NAME",
+        help=f"one or more of {', '.join(STUDY_GARMENTS)} (default: all)",
     )
     option(
-        "--count", type=int, metavar="N", help="manipulations of each garment (10; --fast: one, of another action each)"
+        "--count",
+        type=int,
+        metavar="N",
+        help="manipulations of each garment (default: 10; with --fast one, each of another action)",
     )
-    option("--triangles", type=int, metavar="N", help="of each garment in the fit, about (150; the paper's: 1500)")
-    option("--gap", type=float, metavar="M", help="between layers that touch [m] (0.05; a real one asks for 0.005)")
-    option("--share", type=float, metavar="X", help="of the frames that are fitted, the early ones (0.5)")
-    option("--report", action="store_true", help="only report on the cases that are finished")
+    option("--triangles", type=int, metavar="N", help="approximate number in the fit (default: 150; the paper: 1500)")
+    option(
+        "--gap", type=float, metavar="M", help="distance of layers that touch [m] (default: 0.05; a real one: 0.005)"
+    )
+    option("--share", type=float, metavar="X", help="fraction of early frames that are fitted (default: 0.5)")
+    option("--report", action="store_true", help="only report on finished cases")
 
 
-def cases(options: argparse.Namespace) -> dict[str, dict[str, Any]]:
-    """All cases by name: found in ``--out``, or computed and kept there.
+def load_or_compute(options: argparse.Namespace) -> dict[str, dict[str, Any]]:
+    """Return all cases by name, loaded from ``--out`` or computed and saved there.
 
     Raises:
-        InvalidInput: numbers out of range, or nothing finished to report on.
+        InvalidInput: a number is out of range, or no case is finished to report on.
     """
-    setup, wanted = chosen(options)
+    setup, wanted = choose(options)
     study = ResumableStudy(options.out, asdict(setup))
     if options.report:
-        return finished(study, [what.name for what in wanted], options.out)
-    return study.run({what.name: partial(solve, setup, what) for what in wanted})
+        return load_finished(study, [what.name for what in wanted], options.out)
+    return study.run({what.name: partial(solve_case, setup, what) for what in wanted})
 
 
-def finished(study: ResumableStudy, names: Iterable[str], out: Path) -> dict[str, dict[str, Any]]:
-    """Those of the cases that are there.
+def load_finished(study: ResumableStudy, names: Iterable[str], out: Path) -> dict[str, dict[str, Any]]:
+    """Return the finished cases.
 
     Raises:
-        InvalidInput: none is.
+        InvalidInput: no case is finished.
     """
-    found = {name: case for name in names if (case := study.load_case(name)) is not None}
-    if not found:
+    results = {name: case for name in names if (case := study.load_case(name)) is not None}
+    if not results:
         raise InvalidInput("--report", got=f"no finished case in {out}", expected="at least one")
-    return found
+    return results
 
 
-def chosen(options: argparse.Namespace) -> tuple[Setup, list[Manipulation]]:
-    """Settings, and the manipulations, one of every garment after the other so that a part of them is of use."""
-    setup, count = FAST if options.fast else Setup(), 10 if options.count is None else options.count
+def choose(options: argparse.Namespace) -> tuple[Setup, list[Manipulation]]:
+    """Return settings and manipulations, alternating between garments so that a partial study is useful."""
+    setup, count = FAST_SETUP if options.fast else Setup(), 10 if options.count is None else options.count
     changes = {key: getattr(options, key) for key in ("triangles", "gap", "share") if getattr(options, key) is not None}
     for key, value in {**changes, "count": count}.items():
         if not 0 < value < float("inf"):
@@ -69,7 +83,7 @@ def chosen(options: argparse.Namespace) -> tuple[Setup, list[Manipulation]]:
     setup = replace(setup, **changes)
     if setup.share > 1:
         raise InvalidInput("--share", got=setup.share, expected="a number in (0, 1]")
-    if options.fast and options.count is None:  # an action each
-        return setup, [manipulations(garment)[QUICK[garment]] for garment in options.garments]
+    if options.fast and options.count is None:  # another action for each garment
+        return setup, [manipulations(garment)[FAST_NUMBER[garment]] for garment in options.garments]
     each = [manipulations(garment, count) for garment in options.garments]
     return setup, [what for row in zip(*each, strict=True) for what in row]

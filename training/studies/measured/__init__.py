@@ -1,120 +1,119 @@
-"""Measured cloth: fits of some measurements predict the others, each with its null and its interval.
+"""Measured cloth: fits to some measurements predict the others, each compared with its null and its interval.
 
-Nylon at angles that were not fitted; the third pull of knits from the first two; 10 swings in air from 20 others; the
-sample that the paper's authors released. The data are not shipped: name their folder with --source.
+The study predicts nylon at angles that were not fitted, the third pull of knits from the first two, 10 swings in air
+from 20 others, and the sample that the paper's authors released. The data are not shipped: name their folder by
+--source.
 """
 
 from __future__ import annotations
 
 import argparse
-import json
 import os
 from functools import partial
 from pathlib import Path
 from typing import Any
 
-from torchcloth._utils.files import write_text
 from torchcloth._utils.resume import clear_store
 from torchcloth.errors import InvalidInput
 
-from ...resumable import ResumableStudy
+from ...resumable import ResumableStudy, write_result
 from . import free_swings, measured_figures, measured_tables, sample, swing_predictions, swings, tension
 
-VARIABLE = "TORCHCLOTH_REALDATA"
-SOURCES = (tension.NYLON, tension.KNITS, swings.SOURCE, sample.SOURCE)
+DATA_VARIABLE = "TORCHCLOTH_REALDATA"
+SOURCE_NAMES = (tension.NYLON_SOURCE, tension.KNIT_SOURCE, swings.SOURCE_NAME, sample.SOURCE_NAME)
 
 
 def add(parser: argparse.ArgumentParser) -> None:
-    """Options."""
-    parser.add_argument("--source", type=Path, metavar="DIR", help=f"folder of measured data (${VARIABLE})")
+    """Add the study's options."""
+    parser.add_argument("--source", type=Path, metavar="DIR", help=f"folder of measured data (${DATA_VARIABLE})")
 
 
 def run(options: argparse.Namespace) -> None:
-    """Compute what is missing, then print and draw everything."""
-    source = find(options.source)
+    """Compute the missing cases, then print and draw the results."""
+    source = find_data_folder(options.source)
     study = ResumableStudy(options.out, {"study": "measured", "fast": options.fast, "source": str(source.resolve())})
-    there = [name for name in SOURCES if (source / name).is_dir()]
+    available = [name for name in SOURCE_NAMES if (source / name).is_dir()]
     result: dict[str, Any] = {}
-    if tension.NYLON in there:
-        result["nylon"] = _nylon(study, source / tension.NYLON, options)
-    if tension.KNITS in there:
-        result["knits"] = _knits(study, source / tension.KNITS, options)
-    if swings.SOURCE in there:
-        result["swings"] = _swings(study, source / swings.SOURCE, options)
-    if sample.SOURCE in there:
-        result["sample"] = _sample(study, source / sample.SOURCE, options)
-    for name in set(SOURCES) - set(there):
-        print(f"{source / name} is absent: left out")
-    path = write_text(options.out / "measured.json", json.dumps(result, indent=1, allow_nan=False) + "\n")
+    if tension.NYLON_SOURCE in available:
+        result["nylon"] = _nylon(study, source / tension.NYLON_SOURCE, options)
+    if tension.KNIT_SOURCE in available:
+        result["knits"] = _knits(study, source / tension.KNIT_SOURCE, options)
+    if swings.SOURCE_NAME in available:
+        result["swings"] = _swings(study, source / swings.SOURCE_NAME, options)
+    if sample.SOURCE_NAME in available:
+        result["sample"] = _sample(study, source / sample.SOURCE_NAME, options)
+    for name in set(SOURCE_NAMES) - set(available):
+        print(f"{source / name} does not exist and is left out")
+    path = write_result(options.out / "measured.json", "measured", result)
     drawn = ", ".join(str(p) for p in sorted(options.out.glob("*.png")))
     print(f"result:   {path}\npictures: {drawn}")
 
 
-def find(given: Path | None) -> Path:
-    """The folder of measured data.
+def find_data_folder(given: Path | None) -> Path:
+    """Return the folder of measured data.
 
     Raises:
-        InvalidInput: none was named, or it holds none of the sources.
+        InvalidInput: no folder is named, or it contains none of the sources.
     """
-    expected = f"a folder with some of {', '.join(SOURCES)}"
-    if given is None and not os.environ.get(VARIABLE):
-        raise InvalidInput("--source", got="none", expected=expected, remedy=f"name it, or set {VARIABLE}")
-    source = Path(os.environ[VARIABLE]) if given is None else given
-    if not any((source / name).is_dir() for name in SOURCES):
+    expected = f"a folder with some of {', '.join(SOURCE_NAMES)}"
+    if given is None and not os.environ.get(DATA_VARIABLE):
+        raise InvalidInput("--source", got="none", expected=expected, remedy=f"name it, or set {DATA_VARIABLE}")
+    source = Path(os.environ[DATA_VARIABLE]) if given is None else given
+    if not any((source / name).is_dir() for name in SOURCE_NAMES):
         raise InvalidInput("--source", got=source, expected=expected)
     return source
 
 
 def _nylon(study: ResumableStudy, source: Path, options: argparse.Namespace) -> dict[str, Any]:
     cases = {"nylon": partial(tension.nylon, source, options.out / "nylon", options.fast)}
-    found = study.run(cases)["nylon"]
-    measured_tables.nylon(found, options.out / "nylon")
-    measured_figures.nylon(found, source, options.out / "nylon.png")
-    return found
+    result = study.run(cases)["nylon"]
+    measured_tables.nylon(result, options.out / "nylon")
+    measured_figures.nylon(result, source, options.out / "nylon.png")
+    return result
 
 
 def _knits(study: ResumableStudy, source: Path, options: argparse.Namespace) -> dict[str, Any]:
     names = tension.fabrics(source, options.fast)
     cases = {f"knit-{name}": partial(tension.knit, source, options.out / "knits" / name, name) for name in names}
-    found = dict(zip(names, study.run(cases).values(), strict=True))
-    measured_tables.knits(found)
-    measured_figures.knits(found, source, options.out / "knits.png")
-    return found
+    result = dict(zip(names, study.run(cases).values(), strict=True))
+    measured_tables.knits(result)
+    measured_figures.knits(result, source, options.out / "knits.png")
+    return result
 
 
 def _swings(study: ResumableStudy, source: Path, options: argparse.Namespace) -> dict[str, Any]:
-    fitted, held = swings.split(source, options.fast)
-    found = study.run(
+    fitted, predicted = swings.split(source, options.fast)
+    result = study.run(
         {
             "swings-whole": partial(_fit, source, fitted, options.out, options.fast),
             "swings-free": partial(free_swings.match, source, fitted, options.fast),
         }
     )
     clear_store(_journal(options.out))
-    fits = {part.removeprefix("swings-"): content for part, content in found.items()}
-    models = {"vacuum": dict.fromkeys(swings.NAMES, 0.0), "textbook": swings.START}
+    fits = {part.removeprefix("swings-"): content for part, content in result.items()}
+    models = {"vacuum": dict.fromkeys(swings.FITTED_NAMES, 0.0), "textbook": swings.START_VALUES}
     models |= {part: content["values"] for part, content in fits.items()}
-    cases = study.run({f"swing-{name}": partial(swing_predictions.predict, source, name, models) for name in held})
-    runs = dict(zip(held, cases.values(), strict=True))
-    found = {
+    cases = study.run({f"swing-{name}": partial(swing_predictions.predict, source, name, models) for name in predicted})
+    runs = dict(zip(predicted, cases.values(), strict=True))
+    result = {
         "fitted_runs": fitted,
-        "predicted_runs": held,
+        "predicted_runs": predicted,
         "fits": fits,
         "predicted": swing_predictions.summary(runs, list(models)),
     }
-    measured_tables.swings(found)
-    measured_figures.swings(found, runs, options.out / "swings.png")
-    return found
+    measured_tables.swings(result)
+    measured_figures.swings(result, runs, options.out / "swings.png")
+    return result
 
 
 def _fit(source: Path, names: list[str], out: Path, fast: bool) -> dict[str, Any]:
-    """A fit of many runs as a case; its journal lasts until that is kept."""
+    """Fit many runs as a case; its journal exists until the case is saved."""
     fit = swings.fit(source, names, _journal(out), fast)
     fit.save(out / "swings")
     content = fit.as_dict()
     return {
         "ratios": swings.ratios(content["parameters"]),
-        "values": {name: fit.parameters[name].value for name in swings.NAMES},
+        "values": {name: fit.parameters[name].value for name in swings.FITTED_NAMES},
         "fit": content["fit"],
         "warnings": fit.warnings,
     }
@@ -127,7 +126,7 @@ def _journal(out: Path) -> Path:
 def _sample(study: ResumableStudy, source: Path, options: argparse.Namespace) -> dict[str, Any]:
     journal = options.out / "progress" / "sample"
     work = partial(sample.run, source, options.out / "sample", journal, options.fast)
-    found = study.run({"sample": work})["sample"]
+    result = study.run({"sample": work})["sample"]
     clear_store(journal)
-    measured_tables.sample(found)
-    return found
+    measured_tables.sample(result)
+    return result

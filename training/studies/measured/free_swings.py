@@ -1,7 +1,8 @@
-"""IRI swings: drag and added mass that give the free swings of 20 runs their frequency and decay.
+"""IRI swings: drag and added mass that match frequency and decay of the free swings of 20 runs.
 
-The strokes before are simulated, so that a swing begins as it did, but only the free part after the stop is compared:
-small swings, where a whole run is mostly large and fast ones. Two numbers from two numbers, by repeated proportion.
+The strokes before a swing are simulated, so that it starts as in the recording. Only the free part after the stop is
+compared, where swings are small; most of a whole run are large and fast swings. Two parameters are found from two
+measurements by repeated proportion.
 """
 
 from __future__ import annotations
@@ -11,43 +12,44 @@ from pathlib import Path
 from typing import Any
 
 from ...validation.realdata import swings
-from .swing_predictions import drawn, frequency_and_decay, predict
-from .swings import DENSITY, EFFECTS, NAMES
+from .swing_predictions import bootstrap_indices, frequency_and_decay, predict
+from .swings import FITTED_NAMES, NOMINAL_DENSITY_KG_PER_M2, RATIO_UNITS
 
-BEGIN = {"air.normal": 10.0, "added.length": 0.113, "damping.rate": 0.0}
-ROUNDS, DRAWS = 5, 20
+START_VALUES = {"air.normal": 10.0, "added.length": 0.113, "damping.rate": 0.0}
+PROPORTION_ROUNDS, BOOTSTRAP_DRAWS = 5, 20
 
 
 def match(source: Path, names: Sequence[str], fast: bool) -> dict[str, Any]:
-    """The values, their ratios to the areal density with errors by drawing runs again, and how well they match.
+    """Match drag and added mass; return the values, their ratios to the areal density, and the match.
 
-    A small swing has the frequency f0 / sqrt(1 + mu) with mu the added mass, and its quadratic decay goes as
-    delta f / (1 + mu) with delta the drag; both are exact in the limit, and their steps are repeated.
+    A small swing has the frequency f0 / sqrt(1 + mu) with the added mass mu. Its quadratic decay is proportional to
+    delta f / (1 + mu) with the drag delta. Both hold in the limit of small swings, so the steps are repeated. Standard
+    errors are from a bootstrap over the runs.
     """
-    air, values = swings.AIR, dict(BEGIN)
-    for left in reversed(range(1 if fast else ROUNDS)):
+    air, values = swings.AIR, dict(START_VALUES)
+    for remaining in reversed(range(1 if fast else PROPORTION_ROUNDS)):
         runs = [predict(source, name, {"model": values}) for name in names]
-        seen = frequency_and_decay([run["measured"] for run in runs], drawn(len(runs), DRAWS))
-        reached = frequency_and_decay([run["model"] for run in runs], drawn(len(runs), 1))
-        if left:
-            values = _next(values, seen, reached, air / DENSITY)
-    mass, drag = (air / DENSITY * values[name] for name in ("added.length", "air.normal"))
-    mass_std = 2 * (1 + mass) * seen["frequency_std"] / seen["frequency"]
-    drag_std = drag * seen["decay_std"] / seen["decay"]
-    said = zip(EFFECTS, ((drag, drag_std), (mass, mass_std)), strict=False)
+        measured = frequency_and_decay([run["measured"] for run in runs], bootstrap_indices(len(runs), BOOTSTRAP_DRAWS))
+        simulated = frequency_and_decay([run["model"] for run in runs], bootstrap_indices(len(runs), 1))
+        if remaining:
+            values = _next(values, measured, simulated, air / NOMINAL_DENSITY_KG_PER_M2)
+    mass, drag = (air / NOMINAL_DENSITY_KG_PER_M2 * values[name] for name in ("added.length", "air.normal"))
+    mass_std = 2 * (1 + mass) * measured["frequency_std"] / measured["frequency"]
+    drag_std = drag * measured["decay_std"] / measured["decay"]
+    named = zip(RATIO_UNITS, ((drag, drag_std), (mass, mass_std)), strict=False)
     ratios = {
         name: {"value": v, "std": s, "low": v - 1.96 * s, "high": v + 1.96 * s, "identifiable": s < 0.25 * v}
-        for name, (v, s) in said
+        for name, (v, s) in named
     }
-    return {"values": values, "ratios": ratios, "measured": seen, "reached": reached}
+    return {"values": values, "ratios": ratios, "measured": measured, "reached": simulated}
 
 
 def _next(
-    values: dict[str, float], seen: dict[str, float], reached: dict[str, float], scale: float
+    values: dict[str, float], measured: dict[str, float], simulated: dict[str, float], scale: float
 ) -> dict[str, float]:
-    """By proportion."""
+    """Return the next values by proportion."""
     before = 1 + scale * values["added.length"]
-    faster = reached["frequency"] / seen["frequency"]
+    faster = simulated["frequency"] / measured["frequency"]
     after = before * faster**2
-    drag = values["air.normal"] * seen["decay"] / reached["decay"] * after / before * faster
-    return dict(zip(NAMES, (drag, max(0.0, (after - 1) / scale), 0.0), strict=True))
+    drag = values["air.normal"] * measured["decay"] / simulated["decay"] * after / before * faster
+    return dict(zip(FITTED_NAMES, (drag, max(0.0, (after - 1) / scale), 0.0), strict=True))

@@ -27,7 +27,7 @@ def load_band(prediction: dict[str, Any]) -> PredictionBand:
 def nylon(result: dict[str, Any], source: Path, path: Path) -> Path:
     """Draw each angle as predicted from the other three."""
     figure, axes = _figure(1, len(result["left_out"]), (15, 4))
-    tables = nylon_adapter.tables(source)
+    tables = nylon_adapter.read_tables(source)
     for axis, (angle, prediction) in zip(axes[0], result["left_out"].items(), strict=True):
         table = tables[int(angle)]
         axis.plot(100 * table.strain, table.force, ".", color="black", markersize=3, label="measured")
@@ -46,7 +46,7 @@ def nylon(result: dict[str, Any], source: Path, path: Path) -> Path:
 def knits(result: dict[str, Any], source: Path, path: Path) -> Path:
     """Draw force and lateral strain of the third pull."""
     figure, axes = _figure(2, len(result), (3.4 * len(result) + 0.6, 6.5))
-    fabrics = knit_adapter.fabrics(source)
+    fabrics = knit_adapter.read_fabrics(source)
     for column, (name, fabric) in zip(axes.T, result.items(), strict=True):
         for colour, (one, whole) in zip(
             (AFTER_COLOUR, BEFORE_COLOUR), zip(fabric["directions"].items(), fabrics[name], strict=True), strict=True

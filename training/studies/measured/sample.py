@@ -1,4 +1,4 @@
-"""The sample that the DiffCP paper's authors released: null, start and fit, Chamfer in both directions.
+"""The sample released by the DiffCP paper's authors: Chamfer distances of null, start and fit in both directions.
 
 248 points of 8 clouds; what the simulation assumes is in the adapter (validation/realdata/diffcp_sample.py).
 """
@@ -17,23 +17,23 @@ from torchcloth.recordings import Recording
 
 from ...validation.realdata import diffcp_sample
 
-SOURCE = "diffcp_sample"
-NAMES = ["youngs_modulus"]
-ITERATIONS = 3
-CLOUDS = {True: 3, False: None}  # fast: the first ones
+SOURCE_NAME = "diffcp_sample"
+FITTED_NAMES = ["youngs_modulus"]
+FIT_ITERATIONS = 3
+CLOUD_COUNT = {True: 3, False: None}  # by ``fast``
 
 
 def recording(source: Path, fast: bool) -> Recording:
-    """The episode."""
-    return diffcp_sample.convert(source, count=CLOUDS[fast])
+    """Return the episode."""
+    return diffcp_sample.read_recording(source, count=CLOUD_COUNT[fast])
 
 
 def run(source: Path, out: Path, journal: Path, fast: bool) -> dict[str, Any]:
-    """Fit the membrane stiffness; distances of every model."""
+    """Fit the membrane stiffness and compute the distances of all models."""
     given = recording(source, fast)
     cloth = build_cloth(given)
     resume = (journal / "problem").exists()
-    fit = identify(cloth, given, NAMES, iterations=1 if fast else ITERATIONS, journal=journal, resume=resume)
+    fit = identify(cloth, given, FITTED_NAMES, iterations=1 if fast else FIT_ITERATIONS, journal=journal, resume=resume)
     fit.save(out)
     data, faces = build_episode(cloth, given), torch.as_tensor(cloth.mesh.faces)
     still = data.initial.expand(len(data.times), -1, -1)
@@ -43,20 +43,26 @@ def run(source: Path, out: Path, journal: Path, fast: bool) -> dict[str, Any]:
         "start: 300 N/m": fit.frames_before[0],
         "fitted": fit.frames_after[0],
     }
-    study = {key: fit.parameters["membrane_stiffness"].__dict__[key] for key in ("value", "std", "ci95", "identifiable")}
+    estimate = {
+        key: fit.parameters["membrane_stiffness"].__dict__[key] for key in ("value", "std", "ci95", "identifiable")
+    }
     return {
         "distances": {name: distances(x, data.clouds, faces) for name, x in models.items()},
-        "stiffness": study,
+        "stiffness": estimate,
         "warnings": fit.warnings,
         "points": int(sum(map(len, data.clouds))),
     }
 
 
 def distances(frames: Tensor, clouds: list[Tensor], faces: Tensor) -> dict[str, float]:
-    """Means over the frames [m]: cloud to surface, cloud to the nearest vertex, vertices to the nearest point."""
+    """Return means over the frames [m]: cloud to surface, cloud to nearest vertex, vertices to nearest point."""
     pairs = [(cloud, x) for cloud, x in zip(clouds, frames, strict=True) if len(cloud)]
-    there = [float(chamfer_to_surface(cloud, x, faces)) for cloud, x in pairs]
-    vertex = [float(chamfer_to_vertices(cloud, x)) for cloud, x in pairs]
-    back = [float(chamfer_to_vertices(x, cloud)) for cloud, x in pairs]
+    to_surface = [float(chamfer_to_surface(cloud, x, faces)) for cloud, x in pairs]
+    to_vertices = [float(chamfer_to_vertices(cloud, x)) for cloud, x in pairs]
+    from_vertices = [float(chamfer_to_vertices(x, cloud)) for cloud, x in pairs]
     mean = lambda numbers: sum(numbers) / len(numbers)  # noqa: E731
-    return {"cloud to surface": mean(there), "cloud to vertices": mean(vertex), "vertices to cloud": mean(back)}
+    return {
+        "cloud to surface": mean(to_surface),
+        "cloud to vertices": mean(to_vertices),
+        "vertices to cloud": mean(from_vertices),
+    }

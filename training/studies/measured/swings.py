@@ -1,7 +1,7 @@
 """IRI swings: air and damping from 20 runs.
 
-Only ratios to the unknown areal density are in these data, so it is set to a nominal value and ratios are reported. The
-hanger's and the camera's errors are one nuisance, the camera's pose: the simulation does not care where it takes place.
+The data determine only ratios to the unknown areal density. So it is set to a nominal value, and ratios are reported.
+The errors of hanger and camera are one nuisance, the camera's pose, because the simulation does not depend on its place.
 """
 
 from __future__ import annotations
@@ -19,52 +19,59 @@ from torchcloth.identification import Identification, build_cloth, identify
 
 from ...validation.realdata import swings
 
-SOURCE = "iri_cloth_swings"
-DENSITY = 0.3  # kg/m^2, nominal: only ratios to it are seen
-STIFFNESS, POISSON = 100.0, 0.2  # N/m, assumed: 0.4 % longer under its own weight, 0.2 % of the frequency
-ROWS, COLUMNS = 13, 5  # of vertices: 96 triangles, 0.3 % off the chain's frequency
-EVERY = 2  # frames that are used of a whole run
-HELD_OUT = 3  # every third run is predicted
-NAMES = ["air.normal", "added.length", "damping.rate"]
-START = {"air.normal": 1.2, "added.length": 0.113, "damping.rate": 0.0}  # plate across a stream; ideal fluid, 0.377 L
-PRIORS = {"air.normal": (1.2, 10.0)}  # wide: a plate shaken over a fraction of its width has ten times the drag
+SOURCE_NAME = "iri_cloth_swings"
+NOMINAL_DENSITY_KG_PER_M2 = 0.3  # kg/m^2, nominal: only ratios to it are seen
+ASSUMED_STIFFNESS_N_PER_M, ASSUMED_POISSON_RATIO = (
+    100.0,
+    0.2,
+)  # N/m, assumed: 0.4 % longer under its own weight, 0.2 % of the frequency
+MESH_ROWS, MESH_COLUMNS = 13, 5  # of vertices: 96 triangles, 0.3 % off the chain's frequency
+FRAME_STRIDE = 2  # frames that are used of a whole run
+PREDICTED_STRIDE = 3  # every third run is predicted
+FITTED_NAMES = ["air.normal", "added.length", "damping.rate"]
+START_VALUES = {
+    "air.normal": 1.2,
+    "added.length": 0.113,
+    "damping.rate": 0.0,
+}  # plate across a flow; ideal fluid, 0.377 L
+PRIORS = {"air.normal": (1.2, 10.0)}  # wide, because a plate shaken by a fraction of its width has ten times the drag
 NUISANCES = {"clock": 0.03, "camera": 0.02}
-EFFECTS = {"drag per areal density": "1/m", "added mass per areal density": "-", "damping rate": "1/s"}
+RATIO_UNITS = {"drag per areal density": "1/m", "added mass per areal density": "-", "damping rate": "1/s"}
 
 
 def split(source: Path, fast: bool) -> tuple[list[str], list[str]]:
-    """Names of fitted and of predicted runs."""
+    """Return the names of fitted and of predicted runs."""
     names = sorted(swings.runs(source))
-    held = names[HELD_OUT - 1 :: HELD_OUT]
-    fitted = [name for name in names if name not in held]
-    return (fitted[::10], held[4:5]) if fast else (fitted, held)
+    predicted = names[PREDICTED_STRIDE - 1 :: PREDICTED_STRIDE]
+    fitted = [name for name in names if name not in predicted]
+    return (fitted[::10], predicted[4:5]) if fast else (fitted, predicted)
 
 
 def recording(source: Path, name: str, every: int = 1) -> recordings.Recording:
-    """One run on the study's mesh, with some of its frames."""
+    """Return a run on the study's mesh, with each ``every``-th frame."""
     mesh = _mesh()
-    found = swings.episode(source, name)
+    episode = swings.episode(source, name)
     cloth = replace(
-        found.cloth,
+        episode.cloth,
         sheet=None,
         vertices=mesh.vertices,
         faces=mesh.faces,
         uv=mesh.uv,
-        initial_vertices=found.cloth.interpolate_initial_positions(mesh.uv),
-        areal_density=DENSITY,
+        initial_vertices=episode.cloth.interpolate_initial_positions(mesh.uv),
+        areal_density=NOMINAL_DENSITY_KG_PER_M2,
         areal_density_std=None,
     )
-    chosen = np.arange(len(found.points)) % every == 0
-    return replace(found, cloth=cloth, points=found.points.select(chosen), path=Path(name))
+    chosen = np.arange(len(episode.points)) % every == 0
+    return replace(episode, cloth=cloth, points=episode.points.select(chosen), path=Path(name))
 
 
 def _mesh() -> meshes.Mesh:
     side = swings.SIDE
-    return meshes.rectangle(side, side, resolution=(COLUMNS, ROWS))
+    return meshes.rectangle(side, side, resolution=(MESH_COLUMNS, MESH_ROWS))
 
 
 def cloth_of(run: recordings.Recording, values: dict[str, float]) -> Cloth:
-    """The hanging cloth in air of these values."""
+    """Build the hanging cloth in air with these values."""
     parts = {
         "gravity": effects.Gravity(),
         "air": effects.AirDrag(values["air.normal"], swings.AIR),
@@ -72,25 +79,31 @@ def cloth_of(run: recordings.Recording, values: dict[str, float]) -> Cloth:
         "damping": effects.MassDamping(values["damping.rate"]),
         "bending": effects.Bending(swings.BENDING, swings.DAMPING),
     }
-    return build_cloth(run, materials.AEP(STIFFNESS / 1e-3, POISSON, thickness=1e-3), parts)
+    return build_cloth(
+        run, materials.AEP(ASSUMED_STIFFNESS_N_PER_M / 1e-3, ASSUMED_POISSON_RATIO, thickness=1e-3), parts
+    )
 
 
 def fit(source: Path, names: Sequence[str], journal: Path, fast: bool) -> Identification:
-    """Drag, added mass and damping from these runs; goes on where a stopped fit was. Fast: two steps, all frames."""
-    runs = [recording(source, name, EVERY) for name in names]
-    cloth = cloth_of(runs[0], START)
+    """Fit drag, added mass and damping to these runs, resuming a stopped fit; ``fast``: two steps on all frames."""
+    runs = [recording(source, name, FRAME_STRIDE) for name in names]
+    cloth = cloth_of(runs[0], START_VALUES)
     resume = (journal / "problem").exists()
     brief = {"iterations": 2, "warm_start": True} if fast else {}
-    return identify(cloth, runs, NAMES, nuisances=NUISANCES, priors=PRIORS, journal=journal, resume=resume, **brief)
+    return identify(
+        cloth, runs, FITTED_NAMES, nuisances=NUISANCES, priors=PRIORS, journal=journal, resume=resume, **brief
+    )
 
 
 def ratios(fit: dict[str, Any]) -> dict[str, dict[str, float | bool]]:
-    """What is identifiable, from the parameters of identification.json: ratios to the areal density, and the rate."""
+    """Return the identifiable quantities: ratios to the areal density, and the damping rate."""
     air, out = swings.AIR, {}
-    for effect, key, factor in zip(EFFECTS, NAMES, (air / DENSITY, air / DENSITY, 1.0), strict=True):
-        found = fit[key]
-        low, high = found["ci95"]
-        numbers = {"value": found["value"], "std": found["std"], "low": low, "high": high}
+    for effect, key, factor in zip(
+        RATIO_UNITS, FITTED_NAMES, (air / NOMINAL_DENSITY_KG_PER_M2, air / NOMINAL_DENSITY_KG_PER_M2, 1.0), strict=True
+    ):
+        estimate = fit[key]
+        low, high = estimate["ci95"]
+        numbers = {"value": estimate["value"], "std": estimate["std"], "low": low, "high": high}
         scaled = {name: factor * number for name, number in numbers.items()}
-        out[effect] = {**scaled, "identifiable": found["identifiable"]}
+        out[effect] = {**scaled, "identifiable": estimate["identifiable"]}
     return out

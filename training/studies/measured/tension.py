@@ -1,4 +1,4 @@
-"""Tension: nylon at angles that were not fitted, and the third pull of knits from the first two."""
+"""Tension: predictions of nylon at other angles, and of the third pull of knits from the first two."""
 
 from __future__ import annotations
 
@@ -9,34 +9,35 @@ from typing import Any
 
 import numpy as np
 
-from torchcloth.identification import cross_validate, fit_tension, predict_tension, make_specimen
+from torchcloth.identification import cross_validate, fit_tension, make_specimen, predict_tension
 from torchcloth.identification.tension.model import TensionModel
 from torchcloth.recordings import ForceDisplacement
 
 from ...validation.realdata import knits as knit_adapter
 from ...validation.realdata import nylon as nylon_adapter
 
-NYLON, KNITS = "nylon_offaxis_tension", "knit_tension"
-LIGHT = 5.0  # N, over 0.07 to 0.15 m of knit: what a robot pulls with
-BETWEEN = (15, 60, 75)  # degrees, that were not measured here
-STRAINS = (0.01, 0.02, 0.04)
-EVERY = {True: 8, False: 2}  # rows of nylon; fast, whole
+NYLON_SOURCE, KNIT_SOURCE = "nylon_offaxis_tension", "knit_tension"
+MAX_ROBOT_FORCE_N = 5.0  # over 0.07 to 0.15 m of knit, a typical pull of a robot
+UNMEASURED_ANGLES_DEG = (15, 60, 75)
+REPORTED_STRAINS = (0.01, 0.02, 0.04)
+ROW_STRIDE = {True: 8, False: 2}  # of nylon rows, by ``fast``
 
 
 def nylon(source: Path, out: Path, fast: bool) -> dict[str, Any]:
-    """The four angles together, each from the other three, and angles between; saves the fit for `torchcloth predict`.
+    """Fit four angles together, predict each from the other three, and predict angles between.
 
-    The interval of an angle that was left out takes the law's part from the others, each left out of those three.
+    The fit is saved for `torchcloth predict`. The model error in the interval of a left-out angle is from a nested
+    cross-validation over the other three.
     """
     adapter = nylon_adapter
-    tables = {angle: t.select_rows(slice(None, None, EVERY[fast])) for angle, t in adapter.tables(source).items()}
-    pulls, names = list(tables.values()), adapter.NAMES
-    fit = fit_tension(adapter.start(), pulls, names)
-    *parts, whole = cross_validate(fit, adapter.start(), pulls)
+    tables = {angle: t.select_rows(slice(None, None, ROW_STRIDE[fast])) for angle, t in adapter.read_tables(source).items()}
+    pulls, names = list(tables.values()), adapter.NYLON_PARAMETERS
+    fit = fit_tension(adapter.initial_cloth(), pulls, names)
+    *parts, whole = cross_validate(fit, adapter.initial_cloth(), pulls)
     whole.save(out)
     left_out = {}
     for angle, part in zip(tables, parts, strict=True):
-        *_, nested = cross_validate(part, adapter.start(), [t for a, t in tables.items() if a != angle])
+        *_, nested = cross_validate(part, adapter.initial_cloth(), [t for a, t in tables.items() if a != angle])
         model = nested.model
         unknown = [name for name in names if not part.parameters[name].identifiable]
         left_out[str(angle)] = predict_tension(model, tables[angle]).as_dict() | {"not_identifiable": unknown}
@@ -44,61 +45,68 @@ def nylon(source: Path, out: Path, fast: bool) -> dict[str, Any]:
         "parameters": {name: asdict(fit.parameters[name]) for name in names},
         "fitted": {str(angle): predict_tension(whole.model, t).as_dict() for angle, t in tables.items()},
         "left_out": left_out,
-        "between": {str(angle): at_strains(whole.model, angle) for angle in BETWEEN},
+        "between": {str(angle): at_strains(whole.model, angle) for angle in UNMEASURED_ANGLES_DEG},
         "warnings": fit.warnings,
     }
 
 
 def at_strains(model: TensionModel, angle: float) -> list[dict[str, float]]:
-    """Force of a strip at an angle [degrees] and some strains, with the parts of its error."""
-    table, std = make_specimen(model, radians(angle), strain=max(STRAINS), rows=101)
-    found = predict_tension(model, table, std).force
-    low, high = found.ci95
-    rows = [int(np.abs(table.strain - strain).argmin()) for strain in STRAINS]
-    parts = {"force": found.value, "parameters": found.parameter_std, "law": found.misfit_std, "setup": found.setup_std}
+    """Predict the force of a strip at an angle [degrees] and some strains, with the parts of its standard error."""
+    table, std = make_specimen(model, radians(angle), strain=max(REPORTED_STRAINS), rows=101)
+    prediction = predict_tension(model, table, std).force
+    low, high = prediction.ci95
+    rows = [int(np.abs(table.strain - strain).argmin()) for strain in REPORTED_STRAINS]
+    parts = {
+        "force": prediction.value,
+        "parameters": prediction.parameter_std,
+        "law": prediction.misfit_std,
+        "setup": prediction.setup_std,
+    }
     parts |= {"low": low, "high": high, "strain": table.strain}
     return [{key: float(value[i]) for key, value in parts.items()} for i in rows]
 
 
 def fabrics(source: Path, fast: bool) -> list[str]:
-    """Names of the knits; fast: one."""
-    found = sorted(knit_adapter.fabrics(source))
-    return found[-1:] if fast else found
+    """Return the names of the knits; one if ``fast``."""
+    prediction = sorted(knit_adapter.read_fabrics(source))
+    return prediction[-1:] if fast else prediction
 
 
 def knit(source: Path, out: Path, name: str) -> dict[str, Any]:
-    """One fabric, both directions: fit of repeats 1 and 2, prediction of 3, and how far repeats are from each other."""
+    """Fit repeats 1 and 2 of a fabric in both directions, predict repeat 3, and compute the scatter of repeats."""
     adapter = knit_adapter
-    light = [table.select_rows(table.force < LIGHT) for table in adapter.fabrics(source)[name]]
-    fit = fit_tension(adapter.start(), [table.select_repeats(1, 2) for table in light], adapter.NAMES)
+    light = [table.select_rows(table.force < MAX_ROBOT_FORCE_N) for table in adapter.read_fabrics(source)[name]]
+    fit = fit_tension(adapter.initial_cloth(), [table.select_repeats(1, 2) for table in light], adapter.KNIT_PARAMETERS)
     fit.save(out)
     third = [table.select_repeats(3) for table in light]
     return {
         "poisson_ratio": asdict(fit.parameters["poisson_ratio"]),
         "directions": {
-            label: {"prediction": predict_tension(fit.model, seen).as_dict(), "floor": floor(table)}
-            for label, seen, table in zip("XY", third, light, strict=True)
+            label: {"prediction": predict_tension(fit.model, readings).as_dict(), "floor": repeat_floor(table)}
+            for label, readings, table in zip("XY", third, light, strict=True)
         },
         "warnings": fit.warnings,
     }
 
 
-def floor(table: ForceDisplacement) -> dict[str, float]:
-    """RMS of the third pull from the mean of the first two at the same displacement, as shares of its largest reading.
+def repeat_floor(table: ForceDisplacement) -> dict[str, float]:
+    """Return the RMS difference of the third pull from the mean of the first two, relative to its largest reading.
 
-    No law that knows only these two pulls can be expected to come nearer.
+    A law that is fitted to these two pulls cannot be expected to come nearer.
     """
     third, out = table.select_repeats(3), {}
     for kind in ("force", "lateral_strain"):
-        both = []
+        first_pulls = []
         for k in (1, 2):
             pull = table.select_repeats(k)
             order = np.argsort(pull.displacement)
             values = getattr(pull, kind)[order]
             at = pull.displacement[order]
-            both.append(np.interp(third.displacement, at, values, left=np.nan, right=np.nan))
-        seen = getattr(third, kind)
-        off = seen - np.mean(both, axis=0)
-        known = np.isfinite(off)
-        out[kind.split("_")[0]] = float(np.sqrt((off[known] ** 2).mean()) / np.abs(seen[np.isfinite(seen)]).max())
+            first_pulls.append(np.interp(third.displacement, at, values, left=np.nan, right=np.nan))
+        readings = getattr(third, kind)
+        deviation = readings - np.mean(first_pulls, axis=0)
+        known = np.isfinite(deviation)
+        out[kind.split("_")[0]] = float(
+            np.sqrt((deviation[known] ** 2).mean()) / np.abs(readings[np.isfinite(readings)]).max()
+        )
     return out
