@@ -1,12 +1,12 @@
 import pytest
 
 from torchcloth.errors import MissingDependency
-from torchcloth.observe.render import open3d_or_refuse
+from torchcloth.observe.render import import_open3d
 
 
 @pytest.fixture(scope="session")
 def needs_open3d():
     try:
-        open3d_or_refuse()
+        import_open3d()
     except MissingDependency as error:
         pytest.skip(str(error))

@@ -28,9 +28,9 @@ def test_tables_a_result_and_a_picture(folder, tmp_path, capsys):
 
 def test_json_alone_on_standard_output(folder, capsys):
     assert main(["inspect", str(folder), "--json"]) == 0
-    found = json.loads(capsys.readouterr().out)
-    assert found["streams"]["markers"]["frames"] == 84
-    assert found["episode"] == str(folder)
+    result = json.loads(capsys.readouterr().out)
+    assert result["streams"]["markers"]["frames"] == 84
+    assert result["episode"] == str(folder)
 
 
 @pytest.mark.parametrize("damage", ["absent", "not json", "times", "out is a file"])
@@ -53,9 +53,9 @@ def test_a_bad_episode_is_one_line_and_nothing_is_written(damage, folder, tmp_pa
     assert damage == "out is a file" or not out.exists()
 
 
-def test_depth_images_are_looked_at_and_a_damaged_one_is_one_line(tmp_path, capsys):
+def test_depth_images_are_summarised_and_a_damaged_one_is_one_line(tmp_path, capsys):
     image = pytest.importorskip("PIL.Image")
-    from torchcloth.observe import DepthCamera, encode
+    from torchcloth.observe import DepthCamera, encode_depth
 
     camera = DepthCamera.azure_kinect_nfov(np.eye(4))
     source = tmp_path / "images"
@@ -65,16 +65,16 @@ def test_depth_images_are_looked_at_and_a_damaged_one_is_one_line(tmp_path, caps
     paths = []
     for k in range(3):
         paths.append(source / f"{k:06d}.png")
-        image.fromarray(encode(depth)).save(paths[-1])
+        image.fromarray(encode_depth(depth)).save(paths[-1])
     stream = recordings.ImageStream("depth", np.arange(3), np.arange(3) / 30, tuple(paths), (640, 576))
-    recorded = recordings.Camera(**camera.calibration(), depth_scale=0.001, depth=stream)
+    recorded = recordings.Camera(**camera.to_calibration(), depth_scale=0.001, depth=stream)
     folder = recordings.write(episode(cameras={"cam0": recorded}), tmp_path / "episode")
     assert main(["inspect", str(folder), "--json"]) == 0
-    found = json.loads(capsys.readouterr().out)
-    assert found["depth"]["cam0"]["invalid"] == pytest.approx(0.25)
-    assert found["depth"]["cam0"]["middle"] == pytest.approx(1.25)
-    assert found["depth"]["cam0"]["distorted"]
-    assert found["streams"]["cam0/depth"]["rate"] == pytest.approx(30)
+    result = json.loads(capsys.readouterr().out)
+    assert result["depth"]["cam0"]["invalid_fraction"] == pytest.approx(0.25)
+    assert result["depth"]["cam0"]["median"] == pytest.approx(1.25)
+    assert result["depth"]["cam0"]["has_distortion"]
+    assert result["streams"]["cam0/depth"]["rate"] == pytest.approx(30)
     assert main(["inspect", str(folder), "--out", str(tmp_path / "out")]) == 0
     with image.open(tmp_path / "out" / "inspection.png") as drawn:
         pixels = np.asarray(drawn.convert("RGB"), int)

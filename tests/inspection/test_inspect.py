@@ -1,4 +1,4 @@
-"""Faults that were put into an episode are found, in size and number."""
+"""Faults put into an episode: the inspection finds their size and number."""
 
 import json
 import sys
@@ -12,8 +12,8 @@ from torchcloth import meshes
 from torchcloth import recordings as rec
 from torchcloth.errors import RecordingError
 from torchcloth.inspection import draw, inspect, show
-from torchcloth.inspection.crop_planes import cuts
-from torchcloth.recordings.timing import ticks
+from torchcloth.inspection.crop_planes import find_crop_planes
+from torchcloth.recordings.timing import summarise_timing
 
 GRID = {"extra": {"grid": np.array([8, 8])}}
 
@@ -23,18 +23,18 @@ GRID = {"extra": {"grid": np.array([8, 8])}}
 )
 def test_the_lag_is_found_within_its_error(lag, observed, needs_open3d):
     stream = {"markers": markers(lag=lag, **GRID)} if observed == "markers" else {"points": clouds(lag=lag)}
-    found = inspect(episode(**stream)).lag
-    assert found.told
-    assert found.std < 0.02
-    assert abs(found.value - lag) < max(3 * found.std, 0.01)
-    assert found.stated == 0.0
+    result = inspect(episode(**stream)).lag
+    assert result.is_determined
+    assert result.std < 0.02
+    assert abs(result.value - lag) < max(3 * result.std, 0.01)
+    assert result.recorded == 0.0
 
 
 def test_a_lag_that_the_recording_states_is_no_news():
     recording = replace(episode(markers=markers(lag=0.2, **GRID)), clock_offset=-0.2)
     report = inspect(recording)
     assert report.lag.value == pytest.approx(0.2, abs=0.01)
-    assert report.lag.stated == 0.2
+    assert report.lag.recorded == 0.2
     assert not any("clocks differ" in note for note in report.notes)
     assert any("set clock_offset to -0.2" in n for n in inspect(replace(recording, clock_offset=0.0)).notes)
 
@@ -46,22 +46,22 @@ def test_an_arm_that_holds_nothing_is_drawn_and_not_followed():
     idle = np.stack([0.8 + 0.1 * np.sin(3.1 * hand.t), 0.1 * np.cos(2.3 * hand.t), 0.4 + 0 * hand.t], -1)
     grasp = rec.GraspInfo(uv=np.array([[0.15, 0.3]]), radius=0.02)
     both = {**recording.grippers, "idle": replace(hand, position=idle)}
-    found = inspect(replace(recording, grippers=both, grasps={"hand": grasp}))
-    assert set(found.paths) == {"hand", "idle"}
-    assert found.lag.told
-    assert (found.lag.value, found.lag.std) == (alone.lag.value, alone.lag.std)
-    assert found.noise["markers"] == alone.noise["markers"]
+    result = inspect(replace(recording, grippers=both, grasps={"hand": grasp}))
+    assert set(result.paths) == {"hand", "idle"}
+    assert result.lag.is_determined
+    assert (result.lag.value, result.lag.std) == (alone.lag.value, alone.lag.std)
+    assert result.noise["markers"] == alone.noise["markers"]
     assert not inspect(replace(recording, grippers=both)).lag.std < 2 * alone.lag.std  # where nothing says who holds
 
 
 def test_its_standard_error_is_not_too_small_and_not_worlds_too_large():
     """It allows for errors that last, of which white noise has none."""
     values = [inspect(episode(markers=markers(noise=0.01, seed=seed, **GRID))).lag for seed in range(8)]
-    spread, stated = np.std([v.value for v in values]), np.median([v.std for v in values])
-    assert 0.7 * spread < stated < 6 * spread + 0.003  # a spread of eight is known to a quarter
+    scatter, stated = np.std([v.value for v in values]), np.median([v.std for v in values])
+    assert 0.7 * scatter < stated < 6 * scatter + 0.003  # a spread of eight is known to a quarter
 
 
-def test_a_motion_at_constant_speed_tells_no_lag():
+def test_a_motion_at_constant_speed_determines_no_lag():
     t = np.arange(0, 8, 0.02)
     straight = np.stack([0 * t, 0.1 * t, 0 * t + 0.5], -1)
     recording = episode(markers=markers(**GRID))
@@ -70,27 +70,27 @@ def test_a_motion_at_constant_speed_tells_no_lag():
     quat, closed = np.tile([1.0, 0, 0, 0], (400, 1)), np.ones(400, bool)
     steady = rec.GripperMotion(t, straight, quat, closed)
     report = inspect(replace(recording, grippers={"hand": steady}, markers=replace(stream, xyz=xyz)))
-    assert not report.lag.told
-    assert any("does not tell a lag" in note for note in report.notes)
+    assert not report.lag.is_determined
+    assert any("does not determine a lag" in note for note in report.notes)
 
 
 @pytest.mark.parametrize("noise", [0.001, 0.004])
 def test_static_noise_is_what_was_added(noise, needs_open3d):
     report = inspect(episode(markers=markers(noise=noise, **GRID), points=clouds(noise=noise)))
     assert report.noise["markers"].std == pytest.approx(noise, rel=0.15)
-    assert report.noise["markers"].axes == pytest.approx((noise,) * 3, rel=0.15)
-    assert "all stands" in report.noise["markers"].method
+    assert report.noise["markers"].std_xyz == pytest.approx((noise,) * 3, rel=0.15)
+    assert "at rest" in report.noise["markers"].method
     assert report.noise["points"].std == pytest.approx(noise, rel=0.15)
     assert "still frames" in report.noise["points"].method
 
 
-def test_noise_in_one_direction_is_told_in_it():
+def test_noise_in_one_direction_is_measured_along_it():
     stream = markers(noise=0.0, **GRID)
     ray = np.array([1.0, 1.0, 0.0]) / np.sqrt(2)
     scatter = np.random.default_rng(0).standard_normal((*stream.xyz.shape[:2], 1))
-    found = inspect(episode(markers=replace(stream, xyz=stream.xyz + 0.003 * scatter * ray))).noise["markers"]
-    assert found.std == pytest.approx(0.003, rel=0.1)
-    assert found.axes[2] < 1e-4
+    result = inspect(episode(markers=replace(stream, xyz=stream.xyz + 0.003 * scatter * ray))).noise["markers"]
+    assert result.std == pytest.approx(0.003, rel=0.1)
+    assert result.std_xyz[2] < 1e-4
 
 
 @pytest.mark.parametrize("known", ["grid", "uv", "neither"])
@@ -103,11 +103,11 @@ def test_frames_of_another_size_are_rejected_and_no_others(known):
     spoiled[40] = (middle + 0.8 * (spoiled - middle))[40]
     spoiled[60] = np.nan
     spoiled[5:9, ::7] = np.nan  # unseen, not wrong
-    found = inspect(episode(markers=replace(stream, xyz=spoiled))).frames["markers"]
-    np.testing.assert_array_equal(np.flatnonzero(found.rejected), [10, 11, 12, 13, 14, 40, 60])
-    assert found.coverage[60] == 0
-    assert found.coverage[5] == pytest.approx(54 / 64)
-    assert ("unknown" in found.why) == (known == "neither")
+    result = inspect(episode(markers=replace(stream, xyz=spoiled))).frames["markers"]
+    np.testing.assert_array_equal(np.flatnonzero(result.rejected), [10, 11, 12, 13, 14, 40, 60])
+    assert result.coverage[60] == 0
+    assert result.coverage[5] == pytest.approx(54 / 64)
+    assert ("unknown" in result.criterion) == (known == "neither")
 
 
 @pytest.mark.parametrize(
@@ -124,20 +124,20 @@ def test_material_points_go_before_a_grid():
     inner = np.abs(pattern() - pattern().mean(0)).max(1) < 0.8 * np.ptp(pattern(), axis=0).max() / 2
     side = int(inner.sum() ** 0.5)
     assert side**2 == inner.sum() < 64
-    few = rec.Markers(stream.t, stream.xyz[:, inner], stream.uv[inner], {"grid": np.array([side, side])})
-    assert not inspect(episode(markers=few)).frames["markers"].rejected.any()
+    inner_markers = rec.Markers(stream.t, stream.xyz[:, inner], stream.uv[inner], {"grid": np.array([side, side])})
+    assert not inspect(episode(markers=inner_markers)).frames["markers"].rejected.any()
 
 
 @pytest.mark.filterwarnings("error")
 @pytest.mark.parametrize("frames", [1, 3, 12, 84])
-def test_poor_streams_are_looked_at_without_a_murmur(frames, needs_open3d, tmp_path):
+def test_sparse_streams_are_inspected_without_warnings(frames, needs_open3d, tmp_path):
     stream = markers(extra={})
     xyz = stream.xyz[:frames].copy()
     xyz[np.random.default_rng(0).random(xyz.shape[:2]) < 0.7] = np.nan
-    poor = rec.Markers(stream.t[:frames], xyz)
+    sparse = rec.Markers(stream.t[:frames], xyz)
     single = rec.PointClouds(stream.t[:frames], np.zeros((frames, 3)), np.ones(frames, int))
     for paths in (episode().grippers, {}, {"hand": motion(length=0.5)}):
-        report = inspect(replace(episode(markers=poor, points=single), grippers=paths))
+        report = inspect(replace(episode(markers=sparse, points=single), grippers=paths))
         json.dumps(report.as_dict(), allow_nan=False)
         assert draw(report, tmp_path).is_file()
 
@@ -171,14 +171,14 @@ def test_clouds_outliers_crop_area_and_strangers(needs_open3d):
         frames[i] = np.concatenate([frame[frame[:, 2] > 0.3], frame.mean(0) + rng.uniform(0.3, 0.6, (5, 3))])
     frames[20] = frames[20] * 2.0
     spoiled = rec.PointClouds(stream.t, np.concatenate(frames), np.array([len(f) for f in frames]))
-    found = inspect(episode(points=spoiled)).frames["points"]
-    assert np.flatnonzero(found.rejected).tolist() == [20]
-    assert sum(found.removed.values()) == pytest.approx(5 * len(frames), rel=0.2)
-    assert found.cuts == {"z >": pytest.approx(0.3, abs=2e-3)}
-    whole = inspect(episode(points=stream)).frames["points"]
-    assert whole.cuts == {}
-    assert np.median(whole.coverage) == pytest.approx(1.0, abs=0.1)
-    assert np.median(found.coverage) < 0.85 * np.median(whole.coverage)  # 0.5 m - 0.3 m of the 0.3 m are left
+    result = inspect(episode(points=spoiled)).frames["points"]
+    assert np.flatnonzero(result.rejected).tolist() == [20]
+    assert sum(result.removed.values()) == pytest.approx(5 * len(frames), rel=0.2)
+    assert result.crop_planes == {"z >": pytest.approx(0.3, abs=2e-3)}
+    uncropped = inspect(episode(points=stream)).frames["points"]
+    assert uncropped.crop_planes == {}
+    assert np.median(uncropped.coverage) == pytest.approx(1.0, abs=0.1)
+    assert np.median(result.coverage) < 0.85 * np.median(uncropped.coverage)  # 0.5 m - 0.3 m of the 0.3 m are left
 
 
 def fold(*, cut=-np.inf, frames=60):
@@ -203,36 +203,36 @@ def fold(*, cut=-np.inf, frames=60):
 
 
 def test_a_cloth_that_ends_is_not_cut_off(needs_open3d):
-    assert inspect(fold()).frames["points"].cuts == {}
-    found = inspect(fold(cut=-0.1)).frames["points"].cuts
-    assert found["y >"] == pytest.approx(-0.1, abs=1e-3)
+    assert inspect(fold()).frames["points"].crop_planes == {}
+    result = inspect(fold(cut=-0.1)).frames["points"].crop_planes
+    assert result["y >"] == pytest.approx(-0.1, abs=1e-3)
 
 
-@pytest.mark.parametrize("why", ["held", "whole", "complete", "none"])
-def test_what_excuses_a_bound(why):
+@pytest.mark.parametrize("excuse", ["gripped", "side seen", "complete", "none"])
+def test_a_bound_is_no_crop_plane_with_an_excuse(excuse):
     """A cloud of 0.2 m that swings up from y = 0; a cloth of 0.4 m, unless it is told to be small."""
     rng = np.random.default_rng(0)
-    heights = np.linspace(0.1, 0.25 if why != "whole" else 0.19, 20)
+    heights = np.linspace(0.1, 0.25 if excuse != "side seen" else 0.19, 20)
     clouds = [np.append(rng.uniform(0, [0.1, h, 0.1], (3000, 3)), [[0, 0, 0]], axis=0) for h in heights]
-    side = 0.15 if why == "whole" else 0.4
-    held = np.full((20, 1, 3), 0.02 if why == "held" else 0.5)
-    seen = np.full(20, 1.1 if why == "complete" else 0.6)
-    found = cuts(clouds, clouds, rec.ClothInfo(areal_density=0.2, sheet=(side, side)), seen, held)
-    assert found == ({"y >": 0.0} if why == "none" else {})
+    side = 0.15 if excuse == "side seen" else 0.4
+    grippers = np.full((20, 1, 3), 0.02 if excuse == "gripped" else 0.5)
+    seen = np.full(20, 1.1 if excuse == "complete" else 0.6)
+    result = find_crop_planes(clouds, clouds, rec.ClothInfo(areal_density=0.2, sheet=(side, side)), seen, grippers)
+    assert result == ({"y >": 0.0} if excuse == "none" else {})
 
 
 def test_ticks_gaps_and_jitter():
     t = np.arange(50) / 10
-    even = ticks("points", t)
+    even = summarise_timing("points", t)
     assert (even.frames, even.span, even.gaps) == (50, pytest.approx(4.9), 0)
     assert even.rate == pytest.approx(10)
     assert even.jitter < 1e-12
-    holed = ticks("points", np.delete(t, [20, 21, 22, 40]))
-    assert (holed.gaps, holed.largest_gap) == (2, pytest.approx(0.4))
-    assert holed.rate == pytest.approx(45 / 4.9)
+    with_gaps = summarise_timing("points", np.delete(t, [20, 21, 22, 40]))
+    assert (with_gaps.gaps, with_gaps.largest_gap) == (2, pytest.approx(0.4))
+    assert with_gaps.rate == pytest.approx(45 / 4.9)
     noise = 0.01 * np.random.default_rng(0).standard_normal(2000)
-    assert ticks("points", np.arange(2000) / 10 + noise).jitter == pytest.approx(0.01 * np.sqrt(2), rel=0.1)
-    assert ticks("points", t[:1]).rate == 0.0
+    assert summarise_timing("points", np.arange(2000) / 10 + noise).jitter == pytest.approx(0.01 * np.sqrt(2), rel=0.1)
+    assert summarise_timing("points", t[:1]).rate == 0.0
 
 
 def test_an_episode_without_observations_says_so(capsys, tmp_path):
@@ -255,13 +255,15 @@ def test_without_motion_there_is_no_lag():
 def test_without_motion_nobody_knows_which_frames_are_still(needs_open3d):
     seen = clouds()
     none, some = (inspect(replace(episode(points=seen), **change)) for change in ({"grippers": {}}, {}))
-    assert none.noise["points"].method.endswith("in all frames, as no gripper tells which are still")
-    assert "no gripper" not in some.noise["points"].method
+    assert none.noise["points"].method.endswith("in all frames, because without grippers still frames are unknown")
+    assert "without grippers" not in some.noise["points"].method
 
 
 def test_names_are_no_formulas(tmp_path, needs_open3d):
-    given = episode(points=clouds())
-    odd = replace(given, grippers={"a $x_{$ b": given.grippers["hand"]}, cloth=replace(given.cloth), grasps={})
+    recording = episode(points=clouds())
+    odd = replace(
+        recording, grippers={"a $x_{$ b": recording.grippers["hand"]}, cloth=replace(recording.cloth), grasps={}
+    )
     assert draw(inspect(odd), tmp_path).is_file()
 
 
@@ -269,7 +271,7 @@ def test_the_report_is_json_and_a_picture(tmp_path, capsys, needs_open3d):
     report = inspect(episode(markers=markers(lag=0.1, **GRID), points=clouds(lag=0.1)))
     stored = json.loads(json.dumps(report.as_dict(), allow_nan=False))
     assert stored["lag"]["value"] == pytest.approx(0.1, abs=0.01)
-    assert "constant speed" in stored["lag"]["cannot_tell"]
+    assert "constant speed" in stored["lag"]["caveat"]
     assert set(stored["streams"]) == {"hand", "points", "markers"}
     assert len(stored["frames"]["points"]["coverage"]) == len(report.recording.points)
     assert draw(report, tmp_path).read_bytes().startswith(b"\x89PNG")
@@ -281,21 +283,21 @@ def test_the_report_is_json_and_a_picture(tmp_path, capsys, needs_open3d):
     assert max(map(len, text.splitlines())) <= 120
 
 
-@pytest.mark.parametrize(("stamped", "stated", "moved"), [(0.2, 0.0, -0.2), (0.2, 0.2, -0.2), (0.01, 0.0, 0.0)])
-def test_observations_are_moved_by_a_lag_that_is_clear_only(stamped, stated, moved):
-    recording = replace(episode(markers=markers(lag=stamped, **GRID)), clock_offset=-stated)
-    late = inspect(recording).lag
-    assert late.told
-    assert late.differs == (stamped == 0.2 and stated == 0.0)
-    assert -late.trusted == pytest.approx(moved, abs=0.01 if late.differs else 1e-12)
+@pytest.mark.parametrize(("stamped", "recorded", "moved"), [(0.2, 0.0, -0.2), (0.2, 0.2, -0.2), (0.01, 0.0, 0.0)])
+def test_observations_are_moved_by_a_lag_that_is_clear_only(stamped, recorded, moved):
+    recording = replace(episode(markers=markers(lag=stamped, **GRID)), clock_offset=-recorded)
+    lag = inspect(recording).lag
+    assert lag.is_determined
+    assert lag.differs_from_recorded == (stamped == 0.2 and recorded == 0.0)
+    assert -lag.effective == pytest.approx(moved, abs=0.01 if lag.differs_from_recorded else 1e-12)
 
 
 def test_coverage_and_what_was_removed_are_explained(capsys, monkeypatch, needs_open3d):
     recording = episode(points=clouds())
     show(inspect(recording))
-    said = " ".join(capsys.readouterr().out.split())
-    assert "apart from the cloth" in said
-    assert "outliers not removed" not in said
+    text = " ".join(capsys.readouterr().out.split())
+    assert "apart from the cloth" in text
+    assert "outliers not removed" not in text
     monkeypatch.setitem(sys.modules, "open3d", None)
     show(inspect(recording))
     assert "outliers not removed" in " ".join(capsys.readouterr().out.split())
@@ -304,12 +306,12 @@ def test_coverage_and_what_was_removed_are_explained(capsys, monkeypatch, needs_
 def test_an_unknown_arm_that_stands_by_takes_nothing_away():
     recording = episode(markers=markers(lag=0.1, **GRID))
     grasp = rec.GraspInfo(uv=np.array([[0.15, 0.3]]), radius=0.02)
-    held = replace(recording, grasps={"hand": grasp})
-    beside = replace(held, joints={"spare": rec.JointMotion(np.arange(5) / 10, np.zeros((5, 6)))})
-    alone, found = inspect(held), inspect(beside)
-    assert set(found.paths) == {"hand"}
-    assert (found.lag.value, found.noise["markers"]) == (alone.lag.value, alone.noise["markers"])
-    assert [note for note in found.notes if note not in alone.notes] == [
-        note for note in found.notes if "'spare' stands by and has no path: " in note
+    gripped = replace(recording, grasps={"hand": grasp})
+    with_idle_arm = replace(gripped, joints={"spare": rec.JointMotion(np.arange(5) / 10, np.zeros((5, 6)))})
+    alone, result = inspect(gripped), inspect(with_idle_arm)
+    assert set(result.paths) == {"hand"}
+    assert (result.lag.value, result.noise["markers"]) == (alone.lag.value, alone.noise["markers"])
+    assert [note for note in result.notes if note not in alone.notes] == [
+        note for note in result.notes if "'spare' does not hold the cloth and has no path: " in note
     ]
-    assert len(found.notes) == len(alone.notes) + 1
+    assert len(result.notes) == len(alone.notes) + 1

@@ -10,7 +10,7 @@ import torchcloth as tc
 from torchcloth.robots import replay
 from torchcloth.training.studies import classify, fabrics, pressing, stretching
 from torchcloth.training.studies.command import main
-from torchcloth.training.studies.fabric_trials import FAST_SCALE, ALL_PULLS, sheet_fabric, pressed_layer
+from torchcloth.training.studies.fabric_trials import ALL_PULLS, FAST_SCALE, pressed_layer, sheet_fabric
 from torchcloth.training.studies.paper_fabrics import FABRICS
 from torchcloth.training.studies.synthetic_sheets import interpolate_on_grid
 

@@ -15,9 +15,9 @@ from torchcloth.training.fit.command import main
 
 def free_port() -> str:
     """Nobody listens there."""
-    with socket.socket() as found:
-        found.bind(("127.0.0.1", 0))
-        return str(found.getsockname()[1])
+    with socket.socket() as sock:
+        sock.bind(("127.0.0.1", 0))
+        return str(sock.getsockname()[1])
 
 
 def test_two_processes_are_one(config, episodes, tmp_path):

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from torchcloth.training.studies import command
-from torchcloth.training.studies.manipulations import cases, joint, study_cases, paper_tables
+from torchcloth.training.studies.manipulations import cases, joint, paper_tables, study_cases
 from torchcloth.training.studies.manipulations.measures import pooled_variance, sample_spread
 from torchcloth.training.studies.manipulations.scenes import (
     ACTIONS,

@@ -145,7 +145,9 @@ def test_confounded_cases_ask_for_doubt(said, right):
 
 
 def test_where_the_data_might_tell_its_name_alone_is_right():
-    soft = hidden("confounded", ("air.linear", 1.0), confounded={"causes": ["air.linear", "air.drag_n"], "may_be_separable": True})
+    soft = hidden(
+        "confounded", ("air.linear", 1.0), confounded={"causes": ["air.linear", "air.drag_n"], "may_be_separable": True}
+    )
     assert judged(soft, answer(cause("air.linear")))["right"]
     assert not judged(soft, answer(cause("air.drag_n")))["right"]
 

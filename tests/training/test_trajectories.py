@@ -9,7 +9,7 @@ import torch
 from torchcloth.planning.objective import build_objective
 from torchcloth.training.studies import trajectories
 from torchcloth.training.studies.command import main
-from torchcloth.training.studies.trajectories import FAST_SCALE, make_hidden_goal, sample_surface, build_scene
+from torchcloth.training.studies.trajectories import FAST_SCALE, build_scene, make_hidden_goal, sample_surface
 
 
 def test_points_lie_evenly_on_the_surface():

@@ -10,8 +10,8 @@ import pytest
 import torchcloth
 from torchcloth import meshes, recordings
 from torchcloth.errors import MissingDependency
-from torchcloth.observe.render import open3d_or_refuse
-from torchcloth.viewing import Cloud, Curve, Film, Plane, Sheet, Solid, Trace
+from torchcloth.observe.render import import_open3d
+from torchcloth.viewing import ClothSurface, Cloud, Curve, Film, GripperPath, GroundPlane, RigidBody
 
 EXAMPLE = Path(torchcloth.__file__).parent / "examples" / "bimanual_swing"
 FRAMES = 6
@@ -45,16 +45,16 @@ def film() -> Film:
     )
     poses = np.tile(np.eye(4), (FRAMES, 1, 1))
     poses[:, 2, 3] = 0.2 + lift
-    ball = torchcloth.observe.solid_mesh("sphere", (0.03,), np.eye(4))
+    ball = torchcloth.observe.build_solid_mesh("sphere", (0.03,), np.eye(4))
     corner = 0.6 * np.array([[-1.0, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]])
     return Film(
         title="known",
         times=times,
-        sheets={"cloth": Sheet(x.astype(np.float32), mesh.faces)},
+        sheets={"cloth": ClothSurface(x.astype(np.float32), mesh.faces)},
         clouds={"points": Cloud(points)},
-        solids={"arms/one/ball": Solid(*ball, poses, (255, 0, 0))},
-        planes={"colliders/table": Plane(corner - [0, 0, 0.05])},
-        traces={"grippers/one": Trace(poses[:, :3, 3], poses)},
+        solids={"arms/one/ball": RigidBody(*ball, poses, (255, 0, 0))},
+        planes={"colliders/table": GroundPlane(corner - [0, 0, 0.05])},
+        traces={"grippers/one": GripperPath(poses[:, :3, 3], poses)},
         curves={"force/one": Curve(np.linspace(1.0, 1.5, 11), np.arange(11.0), "N")},
     )
 
@@ -62,7 +62,7 @@ def film() -> Film:
 @pytest.fixture(scope="session")
 def needs_open3d():
     try:
-        open3d_or_refuse()
+        import_open3d()
     except MissingDependency as error:
         pytest.skip(str(error))
 
@@ -78,16 +78,20 @@ def short(tmp_path_factory, example):
     """(folder of the shipped episode's first six frames, identification.json written for it by hand)."""
     folder = tmp_path_factory.mktemp("short") / "swing"
     points = example.points
-    kept = int(points.counts[:FRAMES].sum())
-    cut = recordings.PointClouds(points.t[:FRAMES], points.xyz[:kept], points.counts[:FRAMES])
+    count = int(points.counts[:FRAMES].sum())
+    cut = recordings.PointClouds(points.t[:FRAMES], points.xyz[:count], points.counts[:FRAMES])
     recordings.write(recordings.Recording(**{**vars(example), "points": cut}), folder)
     xyz = recordings.read(folder).points.xyz
     mark = {"name": "swing", "frames": FRAMES, "points": len(xyz), "mean": xyz.mean(0).tolist(), "chamfer": 0.001}
     fit = folder.parent / "identification.json"
     model = {"values": VALUES, "contact": None, "dt": None, "episodes": [mark]}
-    said = {"youngs_modulus": {"std": 100.0, "identifiable": True, "source": "data"}}
-    found = {"parameters": said, "correlation": {name: {name: 1.0} for name in said}, "fit": {"rms_after": 0.0012}}
-    fit.write_text(json.dumps({**found, "model": model}))
+    message = {"youngs_modulus": {"std": 100.0, "identifiable": True, "source": "data"}}
+    result = {
+        "parameters": message,
+        "correlation": {name: {name: 1.0} for name in message},
+        "fit": {"rms_after": 0.0012},
+    }
+    fit.write_text(json.dumps({**result, "model": model}))
     return folder, fit
 
 

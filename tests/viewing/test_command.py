@@ -12,8 +12,8 @@ from torchcloth.cli import main
 def say(capsys, *arguments):
     """(exit code, stdout, stderr)"""
     code = main(["view", *map(str, arguments)])
-    said = capsys.readouterr()
-    return code, said.out, said.err
+    message = capsys.readouterr()
+    return code, message.out, message.err
 
 
 WRONG = {
@@ -44,10 +44,10 @@ WRONG = {
 @pytest.mark.parametrize("case", WRONG)
 def test_wrong_options_are_one_line_and_exit_code_2(short, tmp_path, capsys, monkeypatch, case):
     monkeypatch.chdir(tmp_path)
-    options, said = WRONG[case]
+    options, message = WRONG[case]
     code, out, error = say(capsys, short[0], *options)
     assert (code, out, error.count("\n")) == (2, "", 1)
-    assert said in error.replace("\\", "")
+    assert message in error.replace("\\", "")
     assert list(tmp_path.iterdir()) == []
 
 
@@ -64,9 +64,9 @@ def test_a_folder_is_no_file(short, tmp_path, capsys):
 
 @pytest.mark.parametrize("name", ["a.gif", "a.PNG", "a.rrd", "a.viser", "a.html"])
 def test_an_episode_becomes_a_file(short, tmp_path, capsys, name):
-    code, said, error = say(capsys, short[0], "--truth", "--out", tmp_path / "new" / name)
+    code, message, error = say(capsys, short[0], "--truth", "--out", tmp_path / "new" / name)
     assert (code, error) == (0, "")
-    assert said.startswith(f"{tmp_path / 'new' / name}: ")
+    assert message.startswith(f"{tmp_path / 'new' / name}: ")
     assert (tmp_path / "new" / name).stat().st_size > 5000
 
 
@@ -104,9 +104,9 @@ def test_control_c_ends_the_server(short, capsys, monkeypatch):
         raise KeyboardInterrupt
 
     monkeypatch.setattr("torchcloth.viewing.Viewer.run", interrupted)
-    code, said, error = say(capsys, short[0], "--port", 18480)
+    code, message, error = say(capsys, short[0], "--port", 18480)
     ((port, status),) = asked
     assert (code, status, error) == (0, 200, "")
-    assert said == f"swing: http://localhost:{port} (Ctrl-C ends)\n"
+    assert message == f"swing: http://localhost:{port} (Ctrl-C ends)\n"
     with pytest.raises(OSError, match="refused"):
         urllib.request.urlopen(f"http://127.0.0.1:{port}", timeout=10)

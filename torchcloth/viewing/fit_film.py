@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from ..diagnosis import read_model, make_start_builder
+from ..diagnosis import make_start_builder, read_model
 from ..diagnosis.models.loading import simulate_frames
 from ..episodes.observed import DEFAULT_FRAME_RATE_HZ, build_episode
 from ..episodes.streams import SAME_TIME_S

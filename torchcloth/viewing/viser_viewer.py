@@ -139,7 +139,8 @@ class Viewer:
         """Add colour bar, curves, depth images and notes to the panel."""
         gui, film = self.server.gui, self.film
         if film.has_values:
-            gui.add_image(_colour_bar(), label=f"{film.legend}: 0 to {film.colour_limit:g} {film.unit}; grey: {film.grey_label}")
+            label = f"{film.legend}: 0 to {film.colour_limit:g} {film.unit}; grey: {film.grey_label}"
+            gui.add_image(_colour_bar(), label=label)
         for name, curve in film.curves.items():
             label = {"label": f"{name} [{curve.unit}]", "stroke": "#bd0026", "width": 1.5}
             data = (curve.t - film.times[0], np.asarray(curve.values, float))

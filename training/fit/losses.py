@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from torchcloth.errors import InvalidInput
-from torchcloth.identification.residuals.blocks import BLOCKS
+from torchcloth.identification.residuals.blocks import RESIDUAL_BLOCKS
 from torchcloth.identification.residuals.metrics import huber
 from torchcloth.identification.residuals.rows import ResidualRows, SimulatedEpisode
 from torchcloth.losses import chamfer_to_vertices
@@ -90,7 +90,7 @@ def _distance(mean: Callable[[SimulatedEpisode], Tensor | None]) -> Callable[[Si
 
 
 LOSSES: dict[str, Callable[[SimulatedEpisode, float], Tensor | None]] = {
-    **{block.name: _residuals(block.rows) for block in BLOCKS},
+    **{block.name: _residuals(block.rows) for block in RESIDUAL_BLOCKS},
     "chamfer_to_surface": _distance(chamfer),
     "chamfer_to_vertices": _distance(_to_vertices),
 }

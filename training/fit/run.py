@@ -124,8 +124,8 @@ def _run(config: Config, folder: Path, checkpoint: Path | None) -> FitModule:
 
 def _check_statistics(network: nn.Module | None, run: Run) -> None:
     """Refuse running statistics on several processes, each of which would see only its share of the episodes."""
-    own = () if network is None else network.modules()
-    if run.processes * run.nodes > 1 and any(getattr(m, "track_running_stats", False) for m in own):
+    modules = () if network is None else network.modules()
+    if run.processes * run.nodes > 1 and any(getattr(m, "track_running_stats", False) for m in modules):
         raise InvalidInput(
             "config: learn.network",
             got="layers with running statistics, on several processes",

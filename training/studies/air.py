@@ -90,8 +90,8 @@ def diagnose_group(source: Path, names: Sequence[str], folder: Path, fast: bool)
 def crop_start(source: Path, name: str, seconds: float) -> Recording:
     """Return the beginning of a run, until some seconds after the cloth starts to move."""
     recording = swings.recording(source, name)
-    data, points = iri_swings.runs(source)[name], recording.require("points", by="the study")
-    end = iri_swings.start(data) + iri_swings.lag(data).value + seconds
+    data, points = iri_swings.read_runs(source)[name], recording.require("points", by="the study")
+    end = iri_swings.motion_start(data) + iri_swings.estimate_lag(data).value + seconds
     return replace(recording, points=points.select(points.t <= end), markers=None)
 
 

@@ -70,8 +70,8 @@ def show(result: dict[str, Any]) -> None:
         table_rows.add_row(escape(label), *(_estimate(row, name, *how) for name, how in QUANTITY_FORMAT.items()))
     console.print(table_rows)
     console.print(
-        "Intervals: bootstrap over the runs and, for means, the scatter between groups. decay: B in A' = -B A^2 for the "
-        "amplitude A."
+        "Intervals: bootstrap over the runs and, for means, the scatter between groups. decay: B in A' = -B A^2 for "
+        "the amplitude A."
     )
 
 

@@ -70,7 +70,7 @@ def _notes(cases: int, failed: int) -> list[str]:
     words = "; ".join(f"{name}: {text}" for name, text in CONVENTION_TEXT.items())
     return [
         words + ".",
-        f"{cases} cases, {failed} of them failed. Ours are synthetic, with the same law in truth and model. They show the "
-        "error of method, mesh and sensor, not that of a wrong law. The paper's are of real garments. The paper's "
+        f"{cases} cases, {failed} of them failed. Ours are synthetic, with the same law in truth and model. They show "
+        "the error of method, mesh and sensor, not that of a wrong law. The paper's are of real garments. The paper's "
         "convention depends on the edge length of the mesh: compare our 'vertices' at 1500 triangles only.",
     ]

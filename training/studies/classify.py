@@ -144,8 +144,8 @@ def _show(results: Mapping[str, Mapping[str, Any]]) -> None:
         n, margin = result["trials"], result["margin"]
         distances_text = "–" if margin is None else f"{margin:.1f}"
         console.print(
-            f"{result['right']} of {n} right; nearest wrong fabric {distances_text} standard deviations away; {result['within']} "
-            f"of {n} as near their own as 95 % should be. In brackets: mean distance.\n",
+            f"{result['right']} of {n} right; nearest wrong fabric {distances_text} standard deviations away; "
+            f"{result['within']} of {n} as near their own as 95 % should be. In brackets: mean distance.\n",
             markup=False,
         )
     console.print(f'The paper says that "{CLAIM}" and gives no table of it.', markup=False)

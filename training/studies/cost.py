@@ -209,9 +209,9 @@ def _table(results: dict[str, dict[str, Any]]):
 
 
 TABLE_NOTE = (
-    "descent: plain gradient descent. paper: Adam with the paper's stop at a loss below 15 mm. Both minimise the paper's "
-    "loss (cloud to nearest vertex) in logarithms of the parameters. They use no markers and forces and have no test of "
-    "convergence. *: stopped, not converged. ?: not identifiable. Iterations: of all stages. CPU: of the fit alone. "
-    "clock: elapsed time. load: runnable processes, mean of 5 minutes. Chamfer: one-sided, cloud to surface, at start "
-    "and end. Gauss-Newton counts each of its tangents as a simulation and gives error bars."
+    "descent: plain gradient descent. paper: Adam with the paper's stop at a loss below 15 mm. Both minimise the "
+    "paper's loss (cloud to nearest vertex) in logarithms of the parameters. They use no markers and forces and have "
+    "no test of convergence. *: stopped, not converged. ?: not identifiable. Iterations: of all stages. CPU: of the "
+    "fit alone. clock: elapsed time. load: runnable processes, mean of 5 minutes. Chamfer: one-sided, cloud to "
+    "surface, at start and end. Gauss-Newton counts each of its tangents as a simulation and gives error bars."
 )

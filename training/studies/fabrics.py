@@ -1,4 +1,4 @@
-"""Five fabrics, each stretched ten times: E, ν, k and γ with the paper's tables, and a press that determines k and γ."""
+"""Five fabrics, each stretched ten times: E, ν, k and γ with the paper's tables, and presses for k and γ."""
 
 from __future__ import annotations
 
@@ -27,8 +27,8 @@ from .paper_fabrics import COV, FABRICS, SYMBOLS
 PROMISED_ERROR = {"E": 0.02, "ν": 0.05}  # relative to the truth
 STUDY_TEXT = (
     "Synthetic: truth and model obey the same law, because no other engine has all of its parameters. They differ in "
-    "mesh, step, first shape and density. The data have the errors of sensors (Kinect depth, 30 % hidden, forces). True "
-    "values are the paper's means, read as kPa at 1 mm."
+    "mesh, step, first shape and density. The data have the errors of sensors (Kinect depth, 30 % hidden, forces). "
+    "True values are the paper's means, read as kPa at 1 mm."
 )
 
 

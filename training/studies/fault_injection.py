@@ -3,8 +3,8 @@
 IRI swings get delayed stamps, scaled depths or a tilted camera, so the truth is known exactly. A model with air is
 compared with the recordings with and without the error; the difference of the residuals is screened. Then the
 amplitude is fitted with and without the error, and the difference of both is compared with the truth. With
-``--diagnose``, unchanged swings are diagnosed from vacuum. The swings with an error are then diagnosed from the resulting
-model, with all hypotheses and without a hint at the error.
+``--diagnose``, unchanged swings are diagnosed from vacuum. The swings with an error are then diagnosed from the
+resulting model, with all hypotheses and without a hint at the error.
 """
 
 from __future__ import annotations

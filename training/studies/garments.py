@@ -110,7 +110,7 @@ def _notes(cases: dict[str, dict[str, Any]]) -> list[str]:
         "1 mm; true k and gamma are those of `torchcloth simulate`. Bending and air drag are fitted, too. The early "
         "frames are fitted (half of them, or --share), because later ones are folded and in contact.",
         f"{len(cases)} cases, {len(cases) - len(fits)} failed. {none} identify none of the four: in {unstable} the "
-        f"motion is too unstable for its slopes, {poor} are no better than the rigid-carry null. Parameters that are not "
-        "identifiable have no value and enter no mean. Layers of a garment that are near along the cloth, e.g. front "
-        "and back, do not touch on such coarse meshes.",
+        f"motion is too unstable for its slopes, {poor} are no better than the rigid-carry null. Parameters that are "
+        "not identifiable have no value and enter no mean. Layers of a garment that are near along the cloth, e.g. "
+        "front and back, do not touch on such coarse meshes.",
     ]

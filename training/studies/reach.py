@@ -202,9 +202,9 @@ def _rms(x: np.ndarray, y: np.ndarray) -> float:
 
 
 TABLE_NOTE = (
-    "distance: of the goal's points, with sensor noise, from the cloth at the end (one-sided Chamfer). expected: in the "
-    "simulation of the plan. executed: in MuJoCo. vertices: root mean square distance of all vertices from their places "
-    "after the hidden path."
+    "distance: of the goal's points, with sensor noise, from the cloth at the end (one-sided Chamfer). expected: in "
+    "the simulation of the plan. executed: in MuJoCo. vertices: root mean square distance of all vertices from their "
+    "places after the hidden path."
 )
 
 

@@ -17,7 +17,7 @@ def diagnosis_in(
     model: WorldModel | None = None,
     hypotheses: Sequence[Hypothesis] | None = None,
 ) -> Diagnosis:
-    """Run a diagnosis, resuming a stopped one, and write it to the folder; see ``diagnose`` for arguments and errors."""
+    """Run a diagnosis or resume a stopped one, and write it to the folder; see ``diagnose`` for the arguments."""
     journal = folder / PROGRESS_FOLDER_NAME
     answer = diagnose(recordings, model, hypotheses, journal=journal, resume=journal.exists())
     write_diagnosis(answer, recordings, folder)

@@ -57,9 +57,8 @@ def without_mesh_error(fitted: ModelFit) -> ModelFit:
         b._replace(value=b.value + n)
         for b, n in zip(fitted.linearisation.bins, fitted.linearisation.mesh_differences, strict=True)
     ]
-    linearisation = replace(
-        fitted.linearisation, bins=bins, mesh_differences=[torch.zeros_like(n) for n in fitted.linearisation.mesh_differences]
-    )
+    zeros = [torch.zeros_like(n) for n in fitted.linearisation.mesh_differences]
+    linearisation = replace(fitted.linearisation, bins=bins, mesh_differences=zeros)
     return assemble_fit(fitted.model, linearisation, fit_noise(linearisation))
 
 

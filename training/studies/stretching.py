@@ -220,7 +220,7 @@ def _simulate(truth: tc.Cloth, recording: rec.Recording, frames: np.ndarray, pul
 
 
 def _first_shape(x: np.ndarray, pull: Pull, detail: Detail, rng: np.random.Generator) -> np.ndarray:
-    """Return the first shape [V, 3] m on the model's mesh, with a smooth error and a small error of each free vertex."""
+    """Return the first shape [V, 3] m on the model's mesh, with a smooth error and a small one of each free vertex."""
     share = np.asarray(tc.meshes.rectangle(1.0, 1.0, resolution=detail.model(pull)).uv)
     along = share[:, pull.axis, None]
     start, end = CLAMP_ERROR_M * rng.standard_normal((2, 3))

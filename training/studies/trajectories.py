@@ -29,7 +29,10 @@ from torchcloth.planning.motion_parameters import GripperMotionParameters
 from torchcloth.planning.objective import build_objective
 from torchcloth.planning.task import PlanningTask
 from torchcloth.recordings import ClothInfo, Collider, GraspInfo, Recording
-from torchcloth.robots import DEFAULT_JOINT_ACCELERATION, to_gripper_motion  # pyright: ignore[reportMissingImports] - mapped from robots/
+from torchcloth.robots import (  # pyright: ignore[reportMissingImports] - mapped from robots/
+    DEFAULT_JOINT_ACCELERATION,
+    to_gripper_motion,
+)
 from torchcloth.robots.primitives import GripperLimits  # pyright: ignore[reportMissingImports]
 from torchcloth.types import Trajectory
 
@@ -235,9 +238,9 @@ def sample_surface(x: Tensor, faces: Tensor, count: int, rng: np.random.Generato
 
 
 TABLE_NOTE = (
-    "distance: mean distance of the goal's points, with 1 mm of noise, from the garment at the end. expected: on the mesh "
-    "for planning. executed: the same motion on the finer mesh of the goal. motions: simulated ones. The tangents of a "
-    "Gauss-Newton iteration cost tens of motions, a gradient of Adam two to three (see s). One engine is used for all."
+    "distance: mean distance of the goal's points, with 1 mm of noise, from the garment at the end. expected: on the "
+    "mesh for planning. executed: the same motion on the finer mesh of the goal. motions: simulated ones. The tangents "
+    "of a Gauss-Newton iteration cost tens of motions, a gradient of Adam two to three (see s). All use one engine."
 )
 
 

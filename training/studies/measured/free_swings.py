@@ -26,7 +26,7 @@ def match(source: Path, names: Sequence[str], fast: bool) -> dict[str, Any]:
     delta f / (1 + mu) with the drag delta. Both hold in the limit of small swings, so the steps are repeated. Standard
     errors are from a bootstrap over the runs.
     """
-    air, values = swings.AIR, dict(START_VALUES)
+    air, values = swings.AIR_DENSITY_KG_PER_M3, dict(START_VALUES)
     for remaining in reversed(range(1 if fast else PROPORTION_ROUNDS)):
         runs = [predict(source, name, {"model": values}) for name in names]
         measured = frequency_and_decay([run["measured"] for run in runs], bootstrap_indices(len(runs), BOOTSTRAP_DRAWS))

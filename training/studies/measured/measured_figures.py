@@ -21,7 +21,8 @@ MODEL_COLOURS = {"vacuum": NULL_COLOUR, "textbook": "#c9a227", "whole": AFTER_CO
 
 def load_band(prediction: dict[str, Any]) -> PredictionBand:
     """Load a prediction band from a case's JSON."""
-    return PredictionBand(*(np.array(prediction[key]) for key in ("value", "std_parameters", "std_misfit", "std_setup")))
+    keys = ("value", "std_parameters", "std_misfit", "std_setup")
+    return PredictionBand(*(np.array(prediction[key]) for key in keys))
 
 
 def nylon(result: dict[str, Any], source: Path, path: Path) -> Path:

@@ -94,8 +94,8 @@ def knits(result: dict[str, Any]) -> None:
     console = _console()
     console.print(table)
     console.print(
-        "repeats differ: difference of the third pull from the mean of the first two, the noise floor of any law fitted to "
-        "them. in 95 %: fraction of readings in the interval. nu: symmetric Poisson's ratio"
+        "repeats differ: difference of the third pull from the mean of the first two, the noise floor of any law "
+        "fitted to them. in 95 %: fraction of readings in the interval. nu: symmetric Poisson's ratio"
     )
 
 
@@ -112,8 +112,8 @@ def swings(result: dict[str, Any]) -> None:
     console.print(table)
     console.print(
         "C_n, the depth of air and the areal density are confounded (density set to "
-        f"{NOMINAL_DENSITY_KG_PER_M2:g} kg/m^2): drag is rho C_n / rho_A, added mass is rho depth / rho_A. ±: jackknife "
-        "for whole runs, bootstrap for free swings"
+        f"{NOMINAL_DENSITY_KG_PER_M2:g} kg/m^2): drag is rho C_n / rho_A, added mass is rho depth / rho_A. ±: "
+        "jackknife for whole runs, bootstrap for free swings"
     )
     predicted = result["predicted"]
     table = _table(f"IRI swings: {len(result['predicted_runs'])} runs predicted; ± by bootstrap over these runs")

@@ -1,7 +1,7 @@
 """IRI swings: predictions of 10 held-out runs, compared with the null, vacuum and textbook air.
 
-Three things are used of a predicted run: the path of the tool, the lag of the upper edge behind the tool, and the offset
-of the nodes before the tool moves, which is subtracted from all models.
+Three things are used of a predicted run: the path of the tool, the lag of the upper edge behind the tool, and the
+offset of the nodes before the tool moves, which is subtracted from all models.
 """
 
 from __future__ import annotations
@@ -37,11 +37,11 @@ def predict(source: Path, name: str, models: Mapping[str, Values | World]) -> di
 
 
 def _predict(source: Path, name: str, models: Mapping[str, Values | World]) -> dict[str, Any]:
-    run, data = recording(source, name), swings.runs(source)[name]
+    run, data = recording(source, name), swings.read_runs(source)[name]
     t = run.require("points", by="the study").t
     rows = np.flatnonzero(np.isin(data["t_mesh_s"], t))
     measured_nodes = data["mesh_base_m"].reshape(len(data["t_mesh_s"]), -1, 3)[rows]
-    moving = t - swings.lag(data).value > swings.start(data)
+    moving = t - swings.estimate_lag(data).value > swings.motion_start(data)
     out: dict[str, Any] = {"t": t.tolist(), "measured": _swing(free_swing.extract_swing(name, data))}
     for model, values in {"null": None, **models}.items():
         nodes = _nodes(run, values)
@@ -82,7 +82,7 @@ def _nodes(run: Recording, model: Values | World | None) -> np.ndarray:
 
 def _hits(cloth: Cloth) -> ClosestPoints:
     """Return the places of the camera's 8 x 8 nodes on the sheet."""
-    u = np.linspace(0, swings.SIDE, 8)
+    u = np.linspace(0, swings.SHEET_SIDE_M, 8)
     return locate_on_pattern(cloth.mesh, np.stack(np.meshgrid(u, u, indexing="ij"), -1).reshape(-1, 2))
 
 

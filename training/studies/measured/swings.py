@@ -1,7 +1,7 @@
 """IRI swings: air and damping from 20 runs.
 
 The data determine only ratios to the unknown areal density. So it is set to a nominal value, and ratios are reported.
-The errors of hanger and camera are one nuisance, the camera's pose, because the simulation does not depend on its place.
+The errors of hanger and camera are one nuisance, the camera's pose, because the simulation is invariant to its place.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ RATIO_UNITS = {"drag per areal density": "1/m", "added mass per areal density": 
 
 def split(source: Path, fast: bool) -> tuple[list[str], list[str]]:
     """Return the names of fitted and of predicted runs."""
-    names = sorted(swings.runs(source))
+    names = sorted(swings.read_runs(source))
     predicted = names[PREDICTED_STRIDE - 1 :: PREDICTED_STRIDE]
     fitted = [name for name in names if name not in predicted]
     return (fitted[::10], predicted[4:5]) if fast else (fitted, predicted)
@@ -50,7 +50,7 @@ def split(source: Path, fast: bool) -> tuple[list[str], list[str]]:
 def recording(source: Path, name: str, every: int = 1) -> recordings.Recording:
     """Return a run on the study's mesh, with each ``every``-th frame."""
     mesh = _mesh()
-    episode = swings.episode(source, name)
+    episode = swings.read_episode(source, name)
     cloth = replace(
         episode.cloth,
         sheet=None,
@@ -66,7 +66,7 @@ def recording(source: Path, name: str, every: int = 1) -> recordings.Recording:
 
 
 def _mesh() -> meshes.Mesh:
-    side = swings.SIDE
+    side = swings.SHEET_SIDE_M
     return meshes.rectangle(side, side, resolution=(MESH_COLUMNS, MESH_ROWS))
 
 
@@ -74,10 +74,10 @@ def cloth_of(run: recordings.Recording, values: dict[str, float]) -> Cloth:
     """Build the hanging cloth in air with these values."""
     parts = {
         "gravity": effects.Gravity(),
-        "air": effects.AirDrag(values["air.normal"], swings.AIR),
-        "added": effects.AddedMass(values["added.length"], swings.AIR),
+        "air": effects.AirDrag(values["air.normal"], swings.AIR_DENSITY_KG_PER_M3),
+        "added": effects.AddedMass(values["added.length"], swings.AIR_DENSITY_KG_PER_M3),
         "damping": effects.MassDamping(values["damping.rate"]),
-        "bending": effects.Bending(swings.BENDING, swings.DAMPING),
+        "bending": effects.Bending(swings.IRI_BENDING_N_M, swings.IRI_DAMPING_TIME_S),
     }
     return build_cloth(
         run, materials.AEP(ASSUMED_STIFFNESS_N_PER_M / 1e-3, ASSUMED_POISSON_RATIO, thickness=1e-3), parts
@@ -97,7 +97,7 @@ def fit(source: Path, names: Sequence[str], journal: Path, fast: bool) -> Identi
 
 def ratios(fit: dict[str, Any]) -> dict[str, dict[str, float | bool]]:
     """Return the identifiable quantities: ratios to the areal density, and the damping rate."""
-    air, out = swings.AIR, {}
+    air, out = swings.AIR_DENSITY_KG_PER_M3, {}
     for effect, key, factor in zip(
         RATIO_UNITS, FITTED_NAMES, (air / NOMINAL_DENSITY_KG_PER_M2, air / NOMINAL_DENSITY_KG_PER_M2, 1.0), strict=True
     ):

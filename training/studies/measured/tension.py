@@ -30,7 +30,8 @@ def nylon(source: Path, out: Path, fast: bool) -> dict[str, Any]:
     cross-validation over the other three.
     """
     adapter = nylon_adapter
-    tables = {angle: t.select_rows(slice(None, None, ROW_STRIDE[fast])) for angle, t in adapter.read_tables(source).items()}
+    rows = slice(None, None, ROW_STRIDE[fast])
+    tables = {angle: table.select_rows(rows) for angle, table in adapter.read_tables(source).items()}
     pulls, names = list(tables.values()), adapter.NYLON_PARAMETERS
     fit = fit_tension(adapter.initial_cloth(), pulls, names)
     *parts, whole = cross_validate(fit, adapter.initial_cloth(), pulls)

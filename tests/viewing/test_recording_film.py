@@ -10,8 +10,8 @@ from PIL import Image
 from torchcloth import recordings as rec
 from torchcloth import robots
 from torchcloth.errors import RecordingError
-from torchcloth.viewing import film_of
-from torchcloth.viewing.film import placed
+from torchcloth.viewing import film_from_recording
+from torchcloth.viewing.film import posed_vertices
 
 
 @pytest.fixture
@@ -21,29 +21,29 @@ def rich(tmp_path) -> rec.Recording:
 
 
 def test_frames_are_the_points_on_the_motions_clock(rich):
-    film = film_of(rich)
+    film = film_from_recording(rich)
     assert film.times == pytest.approx(rich.points.t + 0.01)
     for i in range(3):
         np.testing.assert_allclose(film.clouds["points"].frames[i], rich.points.frame(i), atol=1e-6)
 
 
 def test_markers_that_were_not_seen_are_not_shown(rich):
-    shown = film_of(rich).clouds["markers"].frames
-    assert [len(frame) for frame in shown] == [2, 1, 2]
-    np.testing.assert_allclose(shown[1][0], rich.markers.xyz[1, 1], atol=1e-6)
+    drawn = film_from_recording(rich).clouds["markers"].frames
+    assert [len(frame) for frame in drawn] == [2, 1, 2]
+    np.testing.assert_allclose(drawn[1][0], rich.markers.xyz[1, 1], atol=1e-6)
 
 
 def test_an_arm_with_other_joints_than_were_recorded_is_a_note(rich):
     name = next(name for name in rich.joints if name in rich.robots)
     fewer = replace(rich.joints[name], q=rich.joints[name].q[:, :-1])
-    film = film_of(replace(rich, joints={name: fewer}))
+    film = film_from_recording(replace(rich, joints={name: fewer}))
     assert not any(part.startswith(f"arms/{name}") for part in film.solids)
     assert any(f"arm {name!r} is not drawn: q has the wrong shape or type; got" in note for note in film.notes)
 
 
 def test_what_was_seen_at_another_time_is_not_shown(rich):
     late = replace(rich, markers=replace(rich.markers, t=rich.markers.t + 5.0))
-    assert [len(frame) for frame in film_of(late).clouds["markers"].frames] == [0, 0, 0]
+    assert [len(frame) for frame in film_from_recording(late).clouds["markers"].frames] == [0, 0, 0]
 
 
 def test_a_slower_stream_is_shown_all_the_time(rich):
@@ -51,7 +51,9 @@ def test_a_slower_stream_is_shown_all_the_time(rich):
     t = np.linspace(0.1, 0.5, 21)
     points = rec.PointClouds(t, np.zeros((21, 3)), np.ones(21, int))
     slow = replace(rich, points=points, markers=replace(rich.markers, t=np.array([0.1, 0.2, 0.3, 0.4])))
-    assert [len(frame) for frame in film_of(slow).clouds["markers"].frames][:18] == [2] * 3 + [1] * 5 + [2] * 10
+    assert [len(frame) for frame in film_from_recording(slow).clouds["markers"].frames][:18] == [2] * 3 + [1] * 5 + [
+        2
+    ] * 10
 
 
 def depth_only(tmp_path, rich):
@@ -73,19 +75,19 @@ def depth_only(tmp_path, rich):
 
 
 def test_depth_is_shown_where_there_is_nothing_else(rich, tmp_path):
-    film = film_of(depth_only(tmp_path, rich))
+    film = film_from_recording(depth_only(tmp_path, rich))
     (cloud,) = film.clouds.values()
     assert [len(frame) > 500 for frame in cloud.frames] == [True, True]
     assert len(cloud.frames[0]) <= 4000
     x, _, z = cloud.frames[0].T
     assert x.min() > 0  # the mask's half
     assert sorted(set(z.round(4).tolist())) == pytest.approx([0.25, 0.35])
-    assert not any("nothing that was seen" in note for note in film.notes)
+    assert not any("no observation of the cloth" in note for note in film.notes)
 
 
 def test_where_nothing_shows_the_cloth_it_says_so(rich):
-    film = film_of(replace(rich, points=None, markers=None, cameras={}))
-    assert any("nothing that was seen" in note for note in film.notes)
+    film = film_from_recording(replace(rich, points=None, markers=None, cameras={}))
+    assert any("no observation of the cloth" in note for note in film.notes)
 
 
 def test_a_single_knot_of_motion_is_a_picture(example):
@@ -93,11 +95,11 @@ def test_a_single_knot_of_motion_is_a_picture(example):
     one = {name: replace(j, t=j.t[:1], q=j.q[:1], closed=None, width=None, force=None, torque=None)
            for name, j in example.joints.items()}  # fmt: skip
     still = replace(example, points=None, markers=None, cameras={}, truth=None, joints=one, grippers={})
-    assert film_of(still).times.tolist() == [example.joints["left"].t[0]]
+    assert film_from_recording(still).times.tolist() == [example.joints["left"].t[0]]
 
 
 def test_arms_stand_where_the_kinematics_say(example):
-    film = film_of(example)
+    film = film_from_recording(example)
     arm, joints = robots.arm_from_recording(example, "left"), example.joints["left"]
     at = 7
     q = np.array([np.interp(film.times[at], joints.t, column) for column in joints.q.T])
@@ -105,11 +107,11 @@ def test_arms_stand_where_the_kinematics_say(example):
     solids = [solid for name, solid in film.solids.items() if name.startswith("arms/left/")]
     assert len(solids) == len(shapes) > 10
     for solid, shape in zip(solids, shapes, strict=True):
-        np.testing.assert_allclose(placed(solid, at).mean(0), shape.pose[:3, 3].numpy(), atol=1e-6)
+        np.testing.assert_allclose(posed_vertices(solid, at).mean(0), shape.pose[:3, 3].numpy(), atol=1e-6)
 
 
 def test_grippers_follow_the_replayed_motion(example):
-    film = film_of(example)
+    film = film_from_recording(example)
     path = robots.replay(example)["right"]
     knots = np.searchsorted(path.t.numpy(), film.times)
     np.testing.assert_allclose(film.traces["grippers/right"].poses, path.pose[knots].numpy(), atol=1e-6)
@@ -117,7 +119,7 @@ def test_grippers_follow_the_replayed_motion(example):
 
 
 def test_a_robot_that_is_not_known_is_left_out_and_named(rich):
-    film = film_of(rich)
+    film = film_from_recording(rich)
     assert not [name for name in film.solids if name.startswith("arms/spare")]
     assert any("'spare' is not drawn" in note for note in film.notes)
     assert "grippers/left" in film.traces
@@ -125,7 +127,7 @@ def test_a_robot_that_is_not_known_is_left_out_and_named(rich):
 
 def test_a_collider_is_a_square_of_its_plane(rich):
     table = rec.Collider(np.array([0.0, 0, 0.3]), np.array([0.0, 0.6, 0.8]))
-    corners = film_of(replace(rich, colliders={"wedge": table})).planes["colliders/wedge"].corners
+    corners = film_from_recording(replace(rich, colliders={"wedge": table})).planes["colliders/wedge"].corners
     assert (corners - table.point) @ table.normal == pytest.approx(0)
     a, b, c, d = corners
     assert np.linalg.norm(b - a) == pytest.approx(np.linalg.norm(d - a))
@@ -133,48 +135,48 @@ def test_a_collider_is_a_square_of_its_plane(rich):
 
 
 def test_depth_images_come_at_their_time(rich):
-    film = film_of(rich)
+    film = film_from_recording(rich)
     view = film.views["cameras/cam0"]
     assert view.index.tolist() == [0, 1, -1]
-    np.testing.assert_array_equal(view.raw(1), rich.cameras["cam0"].depth.load(1))
-    assert view.raw(2) is None
-    assert film.views["cameras/cam1"].raw(0) is None
+    np.testing.assert_array_equal(view.depth_image(1), rich.cameras["cam0"].depth.load(1))
+    assert view.depth_image(2) is None
+    assert film.views["cameras/cam1"].depth_image(0) is None
 
 
 def test_forces_are_curves(rich):
-    curve = film_of(rich).curves["force/left"]
+    curve = film_from_recording(rich).curves["force/left"]
     assert curve.unit == "N"
     assert curve.values == pytest.approx(np.linalg.norm(rich.grippers["left"].force, axis=1))
 
 
 def test_truth_only_on_request(rich):
-    assert "truth" not in film_of(rich).sheets
-    shown = film_of(rich, truth=True).sheets["truth"]
+    assert "truth" not in film_from_recording(rich).sheets
+    drawn = film_from_recording(rich, truth=True).sheets["truth"]
     t = rich.truth.t
-    share = (film_of(rich).times[0] - t[0]) / (t[1] - t[0])
+    share = (film_from_recording(rich).times[0] - t[0]) / (t[1] - t[0])
     expected = (1 - share) * rich.truth.vertices[0] + share * rich.truth.vertices[1]
-    np.testing.assert_allclose(shown.vertices[0], expected, atol=1e-6)
+    np.testing.assert_allclose(drawn.vertices[0], expected, atol=1e-6)
     with pytest.raises(RecordingError, match="has no truth, which --truth needs"):
-        film_of(replace(rich, truth=None), truth=True)
+        film_from_recording(replace(rich, truth=None), truth=True)
 
 
 def test_streams_that_are_missing_are_not_shown(rich):
     motion = replace(rich, points=None, markers=None, cameras={}, truth=None, joints={}, robots={}, colliders={})
-    film = film_of(motion)
+    film = film_from_recording(motion)
     assert (film.clouds, film.solids, film.planes, film.views) == ({}, {}, {}, {})
     assert film.times[[0, -1]] == pytest.approx([0, 1])
     assert len(film) == 26  # 25 a second
     with pytest.raises(RecordingError, match="nothing to view"):
-        film_of(replace(motion, grippers={}))
+        film_from_recording(replace(motion, grippers={}))
 
 
 def test_frames_of_an_episode_without_points(rich):
     """Markers, else images, else truth give the times."""
-    assert film_of(replace(rich, points=None)).times == pytest.approx(rich.markers.t + 0.01)
+    assert film_from_recording(replace(rich, points=None)).times == pytest.approx(rich.markers.t + 0.01)
     images = replace(rich, points=None, markers=None)
-    assert film_of(images).times == pytest.approx(rich.cameras["cam0"].depth.t + 0.01)
+    assert film_from_recording(images).times == pytest.approx(rich.cameras["cam0"].depth.t + 0.01)
     alone = replace(images, cameras={})
-    assert film_of(alone, truth=True).times == pytest.approx(rich.truth.t)
+    assert film_from_recording(alone, truth=True).times == pytest.approx(rich.truth.t)
 
 
 def test_a_mask_is_that_of_its_own_image(rich, tmp_path):
@@ -182,11 +184,11 @@ def test_a_mask_is_that_of_its_own_image(rich, tmp_path):
     seldom = depth_only(tmp_path, rich)
     camera = seldom.cameras["cam0"]
     second = replace(camera.mask, frames=np.array([1]), t=np.array([0.2]), paths=camera.mask.paths[:1])
-    film = film_of(replace(seldom, cameras={"cam0": replace(camera, mask=second)}))
+    film = film_from_recording(replace(seldom, cameras={"cam0": replace(camera, mask=second)}))
     (cloud,) = film.clouds.values()
     assert [bool((frame[:, 0] < 0).any()) for frame in cloud.frames] == [True, False]
 
 
 def test_links_that_cannot_be_drawn_are_named(example, monkeypatch):
-    monkeypatch.setattr(robots.Arm, "unshaped", ("link3",))
-    assert "of arm 'left' links that are meshes alone are not drawn: link3" in film_of(example).notes
+    monkeypatch.setattr(robots.Arm, "links_without_primitives", ("link3",))
+    assert "arm 'left': links that are given as meshes alone are not drawn: link3" in film_from_recording(example).notes

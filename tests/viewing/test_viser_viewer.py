@@ -1,4 +1,4 @@
-"""The browser's side: the server answers, and what it sends follows the frames."""
+"""Viser server: it answers a browser, and what it sends follows the frames."""
 
 import struct
 import sys
@@ -15,31 +15,31 @@ import websockets.sync.client
 import zstandard
 
 from torchcloth.errors import MissingDependency
-from torchcloth.viewing import Viewer, with_cloth, write_viser
+from torchcloth.viewing import Viewer, add_cloth, write_viser
 
-PORT = 18080  # where the search for a free port begins
+FIRST_PORT = 18080  # the search for a free port begins here
 
 
 @pytest.fixture
-def whole(film):
-    """With a measured cloth, and its truth as a net."""
+def full_film(film):
+    """Return a film with a measured cloth and the outline of its truth."""
     cloth = film.sheets["cloth"]
-    return with_cloth(
+    return add_cloth(
         replace(film, sheets={"truth": cloth}, notes=("one thing is missing",)), cloth.vertices, cloth.faces
     )
 
 
 @pytest.fixture
-def viewer(whole):
-    viewer = Viewer(whole, PORT)
+def viewer(full_film):
+    viewer = Viewer(full_film, FIRST_PORT)
     yield viewer
     viewer.stop()
 
 
 def handle(viewer, name):
-    found = viewer.server.scene.get_handle_by_name(name)
-    assert found is not None, name
-    return found
+    result = viewer.server.scene.get_handle_by_name(name)
+    assert result is not None, name
+    return result
 
 
 def test_the_server_answers_a_browser(viewer):
@@ -56,37 +56,37 @@ def test_a_port_that_is_taken_is_no_obstacle(viewer, film):
         other.stop()
 
 
-def test_everything_follows_the_frame(viewer, whole):
+def test_everything_follows_the_frame(viewer, full_film):
     for frame in (4, 1):
         viewer.show(frame)
-        np.testing.assert_array_equal(handle(viewer, "/points").points, whole.clouds["points"].frames[frame])
-        np.testing.assert_array_equal(handle(viewer, "/truth").vertices, whole.sheets["truth"].vertices[frame])
+        np.testing.assert_array_equal(handle(viewer, "/points").points, full_film.clouds["points"].frames[frame])
+        np.testing.assert_array_equal(handle(viewer, "/truth").vertices, full_film.sheets["truth"].vertices[frame])
         np.testing.assert_allclose(handle(viewer, "/arms/one/ball").position, [0, 0, 0.2 + 0.02 * frame])
         assert viewer.slider.value == frame
-        assert f"{whole.times[frame]:.3f} s" in viewer._clock.content
-        assert "mean distance 1.00 mm" in viewer._clock.content
+        assert f"{full_film.seconds(frame):.3f} s** from the first frame" in viewer._status.content
+        assert "mean distance 1.00 mm" in viewer._status.content
 
 
-def test_bands_of_colour_make_up_the_cloth(viewer, whole):
+def test_bands_of_colour_make_up_the_cloth(viewer, full_film):
     """Every triangle is in one band; 1 mm of 2 mm is in the middle."""
     viewer.show(2)
     bands = [handle(viewer, f"/cloth/{i}") for i in range(13)]
     counts = [len(band.faces) for band in bands]
-    assert sum(counts) == len(whole.sheets["cloth"].faces)
+    assert sum(counts) == len(full_film.sheets["cloth"].faces)
     assert set(np.flatnonzero(counts)) <= {5, 6, 12}
-    np.testing.assert_array_equal(bands[0].vertices, whole.sheets["cloth"].vertices[2])
+    np.testing.assert_array_equal(bands[0].vertices, full_film.sheets["cloth"].vertices[2])
 
 
-def test_the_slider_moves_the_scene(viewer, whole):
+def test_the_slider_moves_the_scene(viewer, full_film):
     viewer.slider.value = 3
     assert viewer.frame == 3
-    np.testing.assert_array_equal(handle(viewer, "/points").points, whole.clouds["points"].frames[3])
+    np.testing.assert_array_equal(handle(viewer, "/points").points, full_film.clouds["points"].frames[3])
 
 
-def test_a_browser_receives_what_is_shown(viewer, whole):
+def test_a_browser_receives_what_is_shown(viewer, full_film):
     """The positions of a frame's points come over the wire as they are."""
     address, version = f"ws://127.0.0.1:{viewer.port}", f"viser-v{viser.__version__}"
-    wanted = whole.clouds["points"].frames[5].tobytes()
+    wanted = full_film.clouds["points"].frames[5].tobytes()
     with websockets.sync.client.connect(address, subprotocols=[version], max_size=None) as browser:
         viewer.show(5)
         deadline = time.monotonic() + 10
@@ -127,9 +127,9 @@ def test_it_plays_in_real_time_and_stops(viewer):
     assert 0.25 < time.monotonic() - began < 5
     viewer.playing.value = False
     time.sleep(0.2)
-    held = viewer.frame
+    frame_before = viewer.frame
     time.sleep(0.3)
-    assert viewer.frame == held
+    assert viewer.frame == frame_before
     viewer.stop()
     thread.join(5)
     assert not thread.is_alive()
@@ -142,24 +142,24 @@ def unpacked(path):
     return msgspec.msgpack.decode(data[8 : 8 + length], strict=False), data
 
 
-def test_a_file_plays_all_frames(whole, tmp_path):
-    content, data = unpacked(write_viser(whole, tmp_path / "a.viser"))
+def test_a_file_plays_all_frames(full_film, tmp_path):
+    content, data = unpacked(write_viser(full_film, tmp_path / "a.viser"))
     assert content["durationSeconds"] == pytest.approx(0.5 + 0.5)
     moments = {round(moment, 6) for moment, _ in content["messages"]}
     assert sorted(moments) == pytest.approx([0.0, 0.1, 0.2, 0.3, 0.4, 0.5])
-    for points in whole.clouds["points"].frames:
+    for points in full_film.clouds["points"].frames:
         assert points.tobytes() in data
     assert [p.name for p in tmp_path.iterdir()] == ["a.viser"]
 
 
-def test_a_page_holds_all_it_needs(whole, tmp_path):
-    text = write_viser(whole, tmp_path / "a.html").read_text()
+def test_a_page_holds_all_it_needs(full_film, tmp_path):
+    text = write_viser(full_film, tmp_path / "a.html").read_text()
     assert text.lstrip().lower().startswith("<!doctype html>")
     assert len(text) > 100_000  # the player is in it
 
 
 def test_a_single_frame_can_be_looked_at(film):
-    viewer = Viewer(film.take(np.array([0])), PORT)
+    viewer = Viewer(film.select_frames(np.array([0])), FIRST_PORT)
     try:
         assert not viewer.playing.value
         viewer.show(0)

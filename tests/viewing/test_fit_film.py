@@ -13,8 +13,8 @@ from torchcloth import recordings
 from torchcloth.errors import InvalidInput, RecordingError
 from torchcloth.losses import chamfer_to_surface
 from torchcloth.recordings import PointClouds
-from torchcloth.viewing import Cloud, film_of_fit, with_cloth
-from torchcloth.viewing.fit_film import _beside, _when, _worst
+from torchcloth.viewing import Cloud, add_cloth, film_from_fit
+from torchcloth.viewing.fit_film import _add_cloth_at_point_times, _choose_colour_limit, _is_observed
 
 
 @pytest.fixture
@@ -25,18 +25,18 @@ def bare(film):
 
 def test_points_one_millimetre_away_colour_the_cloth_so(bare):
     film, cloth = bare
-    shown = with_cloth(film, cloth.vertices, cloth.faces)
-    values = shown.sheets["cloth"].values
+    drawn = add_cloth(film, cloth.vertices, cloth.faces)
+    values = drawn.sheets["cloth"].values
     assert values[np.isfinite(values)] == pytest.approx(1.0, abs=1e-3)
-    assert shown.curves["distance"].values == pytest.approx(1.0, abs=1e-3)
-    assert shown.worst == 2.0
+    assert drawn.curves["distance"].values == pytest.approx(1.0, abs=1e-3)
+    assert drawn.colour_limit == 2.0
 
 
 def test_fabric_without_points_is_unknown(bare):
     film, cloth = bare
     one_side = tuple(points[points[:, 0] > 0] for points in film.clouds["points"].frames)
-    shown = with_cloth(replace(film, clouds={"points": Cloud(one_side)}), cloth.vertices, cloth.faces)
-    known = np.isfinite(shown.sheets["cloth"].values[0])
+    drawn = add_cloth(replace(film, clouds={"points": Cloud(one_side)}), cloth.vertices, cloth.faces)
+    known = np.isfinite(drawn.sheets["cloth"].values[0])
     x = cloth.vertices[0]
     assert not known[x[:, 0] < -0.15].any()
     inside = (np.abs(x[:, 1]) < 0.12) & (x[:, 0] > 0.03) & (x[:, 0] < 0.14)
@@ -48,7 +48,7 @@ def test_near_and_far_points_colour_their_own_places(bare):
     lift = [np.where(p[:, :1] > 0, 4e-3, 0.0) * [[0.0, 0, 1]] for p in film.clouds["points"].frames]
     moved = tuple(p + dz for p, dz in zip(film.clouds["points"].frames, lift, strict=True))
     values = (
-        with_cloth(replace(film, clouds={"points": Cloud(moved)}), cloth.vertices, cloth.faces).sheets["cloth"].values
+        add_cloth(replace(film, clouds={"points": Cloud(moved)}), cloth.vertices, cloth.faces).sheets["cloth"].values
     )
     x = cloth.vertices[0]
     assert np.nanmedian(values[:, x[:, 0] > 0.08]) == pytest.approx(5.0, abs=0.3)
@@ -58,11 +58,11 @@ def test_near_and_far_points_colour_their_own_places(bare):
 def test_points_of_another_time_are_shown_and_not_measured(bare):
     """Markers at 120 Hz, points at 30: between them the cloth has gone on."""
     film, cloth = bare
-    told = np.arange(len(film.times)) % 2 == 0
-    shown = with_cloth(film, cloth.vertices, cloth.faces, told=told)
-    assert np.array_equal(np.isfinite(shown.curves["distance"].values), told)
-    assert np.isnan(shown.sheets["cloth"].values[~told]).all()
-    assert shown.clouds["points"] is film.clouds["points"]
+    is_observed = np.arange(len(film.times)) % 2 == 0
+    drawn = add_cloth(film, cloth.vertices, cloth.faces, is_observed=is_observed)
+    assert np.array_equal(np.isfinite(drawn.curves["distance"].values), is_observed)
+    assert np.isnan(drawn.sheets["cloth"].values[~is_observed]).all()
+    assert drawn.clouds["points"] is film.clouds["points"]
 
 
 def test_frames_between_those_of_the_points_are_left_out(bare):
@@ -70,11 +70,13 @@ def test_frames_between_those_of_the_points_are_left_out(bare):
     film, cloth = bare
     points = PointClouds(film.times[::2], np.zeros((3, 3)), np.ones(3, dtype=int))
     recording = SimpleNamespace(points=points, clock_offset=0.0, observation_noise_std=None)
-    shown = _beside(film, recording, cloth.vertices, cloth.faces)
-    assert np.array_equal(shown.times, film.times[::2])
-    assert np.isfinite(shown.curves["distance"].values).all()
-    np.testing.assert_array_equal(shown.sheets["cloth"].vertices, cloth.vertices[::2])
-    none = _beside(film, SimpleNamespace(points=None, observation_noise_std=None), cloth.vertices, cloth.faces)
+    drawn = _add_cloth_at_point_times(film, recording, cloth.vertices, cloth.faces)
+    assert np.array_equal(drawn.times, film.times[::2])
+    assert np.isfinite(drawn.curves["distance"].values).all()
+    np.testing.assert_array_equal(drawn.sheets["cloth"].vertices, cloth.vertices[::2])
+    none = _add_cloth_at_point_times(
+        film, SimpleNamespace(points=None, observation_noise_std=None), cloth.vertices, cloth.faces
+    )
     assert len(none) == len(film)
 
 
@@ -83,38 +85,38 @@ def test_which_frames_have_points_of_their_own():
     recording = SimpleNamespace(points=points, clock_offset=0.05)
     times = points.t + 0.05
     between = np.sort(np.concatenate([times, times[:-1] + 0.3 * np.diff(times)]))
-    assert np.array_equal(_when(recording, between), np.isin(between, times))
-    assert not _when(SimpleNamespace(points=None), between).any()
+    assert np.array_equal(_is_observed(recording, between), np.isin(between, times))
+    assert not _is_observed(SimpleNamespace(points=None), between).any()
 
 
 def test_a_frame_without_points_has_no_distance(bare):
     film, cloth = bare
     frames = (np.zeros((0, 3), np.float32), *film.clouds["points"].frames[1:])
-    shown = with_cloth(replace(film, clouds={"points": Cloud(frames)}), cloth.vertices, cloth.faces)
-    assert np.isnan(shown.sheets["cloth"].values[0]).all()
-    assert np.isnan(shown.curves["distance"].values[0])
-    assert np.isfinite(shown.curves["distance"].values[1:]).all()
+    drawn = add_cloth(replace(film, clouds={"points": Cloud(frames)}), cloth.vertices, cloth.faces)
+    assert np.isnan(drawn.sheets["cloth"].values[0]).all()
+    assert np.isnan(drawn.curves["distance"].values[0])
+    assert np.isfinite(drawn.curves["distance"].values[1:]).all()
 
 
 def test_without_points_the_cloth_is_plain(bare):
     film, cloth = bare
-    shown = with_cloth(replace(film, clouds={}), cloth.vertices, cloth.faces)
-    assert shown.sheets["cloth"].values is None
-    assert "distance" not in shown.curves
+    drawn = add_cloth(replace(film, clouds={}), cloth.vertices, cloth.faces)
+    assert drawn.sheets["cloth"].values is None
+    assert "distance" not in drawn.curves
 
 
-def test_other_cloths_become_nets(film):
+def test_other_cloths_become_outlines(film):
     cloth = film.sheets["cloth"]
-    shown = with_cloth(replace(film, sheets={"truth": cloth}), cloth.vertices, cloth.faces)
-    assert [(name, sheet.net) for name, sheet in shown.sheets.items()] == [("truth", True), ("cloth", False)]
+    drawn = add_cloth(replace(film, sheets={"truth": cloth}), cloth.vertices, cloth.faces)
+    assert [(name, sheet.outline) for name, sheet in drawn.sheets.items()] == [("truth", True), ("cloth", False)]
 
 
 @pytest.mark.parametrize(
-    ("values", "noise", "worst"),
+    ("values", "noise", "colour_limit"),
     [([0.1], None, 2.0), ([0.1], 1.2e-3, 5.0), ([13.0] * 9, 1e-3, 15.0), ([np.nan], None, 2.0)],
 )
-def test_the_colour_bar_ends_at_a_round_number(values, noise, worst):
-    assert _worst(np.array(values), noise) == pytest.approx(worst)
+def test_the_colour_bar_ends_at_a_round_number(values, noise, colour_limit):
+    assert _choose_colour_limit(np.array(values), noise) == pytest.approx(colour_limit)
 
 
 @pytest.fixture(scope="module")
@@ -122,7 +124,7 @@ def fitted(short):
     """The film of the shipped episode's first frames with its fit."""
     folder, fit = short
     torch.set_default_dtype(torch.float64)
-    return film_of_fit(recordings.read(folder), fit)
+    return film_from_fit(recordings.read(folder), fit)
 
 
 def test_the_fit_is_simulated_again(fitted, short):
@@ -141,7 +143,7 @@ def test_a_replay_that_is_not_the_fits_is_said(spoiled):
     folder, path, content = spoiled
     content["model"]["episodes"][0]["chamfer"] = 0.003
     path.write_text(json.dumps(content))
-    film = film_of_fit(recordings.read(folder), path.parent)  # the folder will do
+    film = film_from_fit(recordings.read(folder), path.parent)  # the folder will do
     assert any("the fit was 3.00" in note for note in film.notes)
 
 
@@ -149,7 +151,7 @@ def test_an_episode_that_was_not_fitted_is_a_prediction(short):
     recording = recordings.read(short[0])
     points = recording.points
     other = replace(recording, points=replace(points, xyz=points.xyz + np.array([0.0, 0.0, 0.002])))
-    film = film_of_fit(other, short[1])
+    film = film_from_fit(other, short[1])
     assert "swing: predicted, " in film.title
     assert not film.notes
 
@@ -174,19 +176,19 @@ BROKEN = {
 @pytest.mark.parametrize("case", BROKEN)
 def test_a_broken_fit_is_refused(spoiled, case):
     folder, path, content = spoiled
-    change, said = BROKEN[case]
+    change, message = BROKEN[case]
     path.write_text(change(content))
-    with pytest.raises((InvalidInput, RecordingError), match=said) as refused:
-        film_of_fit(recordings.read(folder), path)
+    with pytest.raises((InvalidInput, RecordingError), match=message) as refused:
+        film_from_fit(recordings.read(folder), path)
     assert "\n" not in str(refused.value)
 
 
 def test_a_fit_that_is_not_there(short, tmp_path):
     with pytest.raises(InvalidInput, match=r"no .*identification\.json; expected"):
-        film_of_fit(recordings.read(short[0]), tmp_path)
+        film_from_fit(recordings.read(short[0]), tmp_path)
 
 
 def test_moving_the_episode_does_not_matter(short, tmp_path, fitted):
     moved = shutil.copytree(short[0], tmp_path / "elsewhere")
-    again = film_of_fit(recordings.read(moved), short[1])
+    again = film_from_fit(recordings.read(moved), short[1])
     np.testing.assert_array_equal(again.sheets["cloth"].vertices, fitted.sheets["cloth"].vertices)
