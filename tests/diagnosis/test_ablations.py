@@ -45,8 +45,8 @@ def test_without_nuisances_what_differs_from_episode_to_episode_would_be_a_cause
         ev = toys.evidence(slopes, 2, NAMES, torch.zeros(5).double(), seed)
         off = [std * x for x in (2.0, 2.0, 0.5, 1.5)]
         cells = [c._replace(value=c.value + x * c.jacobian[:, -1]) for c, x in zip(ev.bins, off, strict=True)]
-        right += present(toys.fitted(replace(ev, cells=cells, stds=[torch.tensor([std]).double()] * len(off))))
-        wrong += present(toys.fitted(replace(ev, cells=cells, stds=[torch.tensor([1e-9]).double()] * len(off))))
+        right += present(toys.fitted(replace(ev, bins=cells, nuisance_stds=[torch.tensor([std]).double()] * len(off))))
+        wrong += present(toys.fitted(replace(ev, bins=cells, nuisance_stds=[torch.tensor([1e-9]).double()] * len(off))))
     assert right == 0
     assert wrong > 30
 
@@ -71,7 +71,7 @@ def test_tested_against_zero_what_does_not_matter_would_be_a_cause():
         found = toys.fitted(made((0.0, 0.2, 0.0), seed))
         right += present(found)
         anything = [replace(h, smallest_fraction=0.0) for h in found.linearisation.hypotheses]
-        wrong += present(replace(found, evidence=replace(found.linearisation, hypotheses=anything)))
+        wrong += present(replace(found, linearisation=replace(found.linearisation, hypotheses=anything)))
     assert right == 0
     assert wrong > 30
 
@@ -81,7 +81,7 @@ def test_on_one_mesh_what_a_mesh_does_would_be_a_cause():
     ev = made((0.0, 0.6, 0.0))
     other = [-1.5 * c.jacobian[:, 3] for c in ev.bins]
     assert present(toys.fitted(ev)) == 1
-    assert present(toys.fitted(replace(ev, numerics=other))) == 0
+    assert present(toys.fitted(replace(ev, mesh_differences=other))) == 0
 
 
 def test_a_tangent_would_not_see_what_begins_slowly(monkeypatch):

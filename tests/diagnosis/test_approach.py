@@ -3,7 +3,8 @@
 import pytest
 import torch
 
-from torchcloth.diagnosis.inference.warm_start import FARTHEST, _fit_parabola, _minimise_parabola
+from torchcloth.diagnosis.decide.criteria import CRITERIA
+from torchcloth.diagnosis.inference.warm_start import _fit_parabola, _minimise_parabola
 
 
 def quotients(curve, ahead, back):
@@ -19,7 +20,10 @@ def test_a_parabola_passes_through_both_sides_however_far_each_goes(ahead, back)
     """One side that ends at once, as stiffening below none, leaves a straight line and not half a parabola."""
     a, b = (torch.tensor([step]).double() for step in (ahead, back))
     first, second = (torch.tensor(v).double()[:, None] for v in ([1.0, -2.0, 0.5], [0.3, 0.1, -0.2]))
-    curve = lambda u: first * u + second * u * u  # noqa: E731
+
+    def curve(u):
+        return first * u + second * u * u
+
     slope, bend = _fit_parabola(*quotients(curve, a, b), a, b)
     for end in (a, -b):
         torch.testing.assert_close(slope * end + bend * end**2, curve(end))
@@ -33,9 +37,11 @@ def test_the_lowest_place_lies_within_the_ends_and_the_others_make_up_for_it():
     slope = torch.stack([a, a + 0.3 * torch.randn(50, generator=rng).double()], 1)
     value = -slope @ torch.tensor([-0.8, 0.1]).double()
     none, pull = torch.zeros(2).double(), torch.full((2,), 1e-3).double()
-    far = torch.full((2,), FARTHEST).double()
+    far = torch.full((2,), CRITERIA.warm_start.max_step_widths).double()
     free = _minimise_parabola(value, slope, 0 * slope, none, pull, (-far, far))
     assert free.tolist() == pytest.approx([-0.8, 0.1], abs=1e-3)
-    held = _minimise_parabola(value, slope, 0 * slope, none, pull, (torch.tensor([0.0, -FARTHEST]).double(), far))
+    bounded = _minimise_parabola(
+        value, slope, 0 * slope, none, pull, (torch.tensor([0.0, -CRITERIA.warm_start.max_step_widths]).double(), far)
+    )
     other = -float(slope[:, 1] @ value / (slope[:, 1] @ slope[:, 1]))
-    assert held.tolist() == pytest.approx([0.0, other], abs=1e-3)
+    assert bounded.tolist() == pytest.approx([0.0, other], abs=1e-3)

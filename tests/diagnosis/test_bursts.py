@@ -93,7 +93,7 @@ def test_what_ripples_does_not_count_in_millimetres():
     """Two windows that noise of roughness describes are centimetres off: with it the others are what one sees."""
     away = drawn(0, 0.03)
     rough = 0.02 * ((away.bins[0].window == 2) | (away.bins[0].window == 3)).double()
-    known = replace(away, cells=[away.bins[0]._replace(rough=rough), *away.bins[1:]])
+    known = replace(away, bins=[away.bins[0]._replace(roughness=rough), *away.bins[1:]])
     plain, told = (predict_held_out(toys.fitted(ev), list("abcd")) for ev in (drawn(0), known))
     assert float(told.smooth_fraction.min()) < 1e-3
     assert float(told.smooth_fraction[told.episode > 0].min()) == 1.0
@@ -105,7 +105,7 @@ def test_what_one_episode_tells_is_not_thinned_by_the_others():
     """A millimetre is mended in one of four episodes."""
     told = predict_held_out(toys.fitted(drawn(0)), list("abcd"))
     first = (told.episode == 0).double()
-    wrong = told._replace(value=told.residual + 1e-3 * first)
+    wrong = told._replace(residual=told.residual + 1e-3 * first)
     gain = compare(wrong, told, 0.0)
     assert gain.rms_removed[0] == pytest.approx(1e-3, rel=0.3)
     assert (gain.robust_rms[0] ** 2 - gain.robust_rms[1] ** 2) ** 0.5 < 0.7 * gain.rms_removed[0]

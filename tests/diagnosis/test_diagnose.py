@@ -90,7 +90,7 @@ def test_the_cloud_is_shown_over_both_models_where_the_first_is_farthest_off(wit
         assert np.array_equal(o.points.numpy(), own)
         before, after = (float(d.mean()) for d in o.distances)
         assert after < (1.05 if o.motion == "lift" else 0.25) * before  # lifted, drag hardly shows
-    figure = draw_cloud_overlays(answer.overlays, answer.found.setting.sheet.faces.numpy())
+    figure = draw_cloud_overlays(answer.overlays, answer.found.setting.surface.faces.numpy())
     assert len(figure.axes) == 2 * len(answer.overlays) + 1
     assert "with causes" in figure.axes[-2].get_title()
 
@@ -176,10 +176,10 @@ def test_where_nothing_is_hidden_nothing_is_named():
     apart = [
         torch.full_like(n, 0.03) for n in end.linearisation.mesh_differences
     ]  # m, and N: both meshes fold the cloth elsewhere
-    folded = replace(answer.search, end=replace(end, evidence=replace(end.linearisation, numerics=apart)))
+    folded = replace(answer.search, end=replace(end, linearisation=replace(end.linearisation, mesh_differences=apart)))
     assert judge(folded, folded.data.motions).verdict == "numerics"
     setting, (first, *others) = answer.search.data, answer.search.data.episodes
-    late = replace(answer.search, setting=replace(setting, episodes=(replace(first, frames_after_motion=3), *others)))
+    late = replace(answer.search, data=replace(setting, episodes=(replace(first, frames_after_motion=3), *others)))
     assert any("come after the motion's end" in text for text in judge(late, setting.motions).content["warnings"])
 
 

@@ -9,7 +9,8 @@ from helpers import linear_evidence as toys
 from torchcloth.diagnosis.causes.fabric import BENDING_EFFECTS, MEMBRANE_EFFECTS
 from torchcloth.diagnosis.causes.hypotheses import list_known_hypotheses
 from torchcloth.diagnosis.decide import search
-from torchcloth.diagnosis.inference.heterogeneity import LAWS, propose_from_heterogeneity
+from torchcloth.diagnosis.decide.criteria import CRITERIA
+from torchcloth.diagnosis.inference.heterogeneity import EFFECTS_OF_PARAMETER, propose_from_heterogeneity
 
 NAMES = ["a", "b", "c", "d"]
 
@@ -49,14 +50,17 @@ def test_two_motions_are_too_few_to_tell_the_odd_one():
 
 
 def test_the_laws_are_the_catalogues():
-    assert {effect for _, own in LAWS.values() for effect in own} <= {h.effect for h in list_known_hypotheses()}
+    assert EFFECTS_OF_PARAMETER.keys() == CRITERIA.heterogeneity.max_log_std.keys()
+    assert {effect for effects in EFFECTS_OF_PARAMETER.values() for effect in effects} <= {
+        h.effect for h in list_known_hypotheses()
+    }
 
 
 def test_where_nothing_is_disputed_nothing_is_fitted(monkeypatch):
     monkeypatch.setattr(search, "evaluate_candidates", lambda *_: pytest.fail("nothing to try"))
     start = fitted(0.02)
     chain = search._search_heterogeneous(
-        start, type("S", (), {"names": NAMES})(), list_known_hypotheses(), lambda _: None
+        start, type("S", (), {"motions": NAMES})(), list_known_hypotheses(), lambda _: None
     )
     assert chain.accepted == []
     assert chain.fit is start

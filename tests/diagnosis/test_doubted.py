@@ -22,28 +22,28 @@ def models(cause, law):
 
     def model(*columns):
         cells = [c._replace(jacobian=c.jacobian[:, [*columns, 4]]) for c in every.bins]
-        return toys.fitted(replace(every, cells=cells, own=len(columns)), std=5.0)
+        return toys.fitted(replace(every, bins=cells, n_coordinates=len(columns)), std=5.0)
 
     return model(0, 1), model(0, 1, 2), model(0, 1, 3)
 
 
 def doubted(monkeypatch, cause, law, useful=True):
     start, end, other = models(cause, law)
-    best = SimpleNamespace(fitted=other, alone=set(), hypothesis=toys.hypothesis("a"))
-    own = SimpleNamespace(best=SimpleNamespace(alone=set(), hypothesis=toys.hypothesis("c")))
-    monkeypatch.setattr(search, "evaluate_candidates", lambda *_: SimpleNamespace(best=best) if useful else None)
+    best = SimpleNamespace(fit=other, sole_informative_motion=set(), hypothesis=toys.hypothesis("a"))
+    own = SimpleNamespace(candidate=SimpleNamespace(sole_informative_motion=set(), hypothesis=toys.hypothesis("c")))
+    monkeypatch.setattr(search, "evaluate_candidates", lambda *_: SimpleNamespace(candidate=best) if useful else None)
     first = predict_held_out(reweight_by_noise(start, end.noise, end.linearisation), NAMES)
     whole = compare(first, predict_held_out(end, NAMES), 0.0)
-    setting = SimpleNamespace(names=NAMES, recordings=(), episodes=())
+    setting = SimpleNamespace(motions=NAMES, recordings=(), episodes=())
     found = SimpleNamespace(
-        start=start, end=end, steps=[own], causes=[own], whole=whole, setting=setting, impossible=()
+        start=start, end=end, accepted=[own], causes=[own], total_gain=whole, data=setting, not_simulated=()
     )
     return found, replace_by_law(found, start, 2)  # type: ignore[arg-type]
 
 
 def test_a_cause_that_only_stands_in_is_withdrawn(monkeypatch):
     found, after = doubted(monkeypatch, cause=0.3, law=1.0)
-    assert found.whole.density > 0  # it was of use
+    assert found.total_gain.log_density > 0  # it was of use
     assert after.withdrawn == ("c",)
     assert after.accepted == []
     assert after.end is found.start

@@ -125,7 +125,7 @@ def test_distances_are_those_of_two_columns():
     beyond = lambda j, target: (
         left(torch.cat([fitted, wide(j)[:, None]], 1), target)
         - CRITERIA.candidate.simulator_tolerance * left(fitted, target)
-    )  # noqa: E731
+    )
     one, other = beyond(0, 0.7 * wide(2)), beyond(2, 0.4 * wide(0))
     assert told == pytest.approx(min(one, other), rel=1e-6)
     again = white[: len(white) // 2][:, [0, 1, 4, 2]]
@@ -136,7 +136,7 @@ def test_distances_are_those_of_two_columns():
 def smooth(*of):
     """As if no cloth rippled."""
     found = central_differences(*of)
-    return found._replace(rough=torch.zeros_like(found.roughness))
+    return found._replace(roughness=torch.zeros_like(found.roughness))
 
 
 @pytest.mark.parametrize("said", ["causes", "minor"])
@@ -165,19 +165,19 @@ def test_gravity_and_camera_are_told_apart_by_turning(said, monkeypatch):
 
 def test_nothing_open_asks_for_nothing():
     end = toys.fitted(toys.evidence(toys.smooth(5, 4), 1, ["a", "b"], torch.zeros(3).double(), 0))
-    found, none = SimpleNamespace(causes=[], minor=[], screened=[], end=end), {"causes": [], "minor": []}
+    found, none = SimpleNamespace(causes=[], minor=[], scores=[], end=end), {"causes": [], "minor": []}
     assert propose_experiment(found, none, SimpleNamespace(recordings=()), print) is None
 
 
 def test_what_does_the_same_as_a_fitted_number_is_not_waited_for():
     """No motion tells a density from the fabric's own; its data sheet alone does."""
     end = toys.fitted(toys.evidence(toys.smooth(5, 4), 1, ["a", "b"], torch.zeros(3).double(), 0))
-    twin, other = replace(toys.hypothesis("a"), twin=end.model.parameters[0].name), toys.hypothesis("b")
-    end = replace(end, evidence=replace(end.linearisation, hypotheses=[twin, other]))
+    twin, other = replace(toys.hypothesis("a"), equivalent_parameter=end.model.parameters[0].name), toys.hypothesis("b")
+    end = replace(end, linearisation=replace(end.linearisation, hypotheses=[twin, other]))
     rows = [SimpleNamespace(hypothesis=h, decision="inconclusive") for h in (twin, other)]
-    found, none = SimpleNamespace(causes=[], minor=[], screened=rows, end=end), {"causes": [], "minor": []}
+    found, none = SimpleNamespace(causes=[], minor=[], scores=rows, end=end), {"causes": [], "minor": []}
     assert find_open_question(found, none).amplitudes.keys() == {"b"}
-    found.screened = rows[:1]
+    found.scores = rows[:1]
     assert find_open_question(found, none) is None
 
 

@@ -30,10 +30,10 @@ def asked(made):
 def on_finer(made, hypothesis, key):
     """Slopes by simulations of the finer mesh alone, for the cells of ``key``."""
     model, setting = made
-    finer, world = setting.finer, refine_model(model, [RECORDING])[0].build_world()
+    finer, world = setting.fine_mesh, refine_model(model, [RECORDING])[0].build_world()
     e = finer.episodes[0]
     base, moved = world.simulate_observed(e), hypothesis.apply(world, hypothesis.typical).frames(e)
-    found = bin_residuals(base, finite_differences(base, [moved], [hypothesis.typical]), e, finer.sheet, finer.rest)
+    found = bin_residuals(base, finite_differences(base, [moved], [hypothesis.typical]), e, finer.surface, finer.rest)
     return align_rows(key, found.key, found.jacobian)[:, 0]
 
 
@@ -102,8 +102,8 @@ def test_without_a_finer_mesh_it_is_as_the_others(made, asked):
 def test_what_does_nothing_on_the_given_mesh_is_not_simulated_on_the_finer(made, asked):
     model, setting = made
     (crease,) = (h for h in list_hypotheses(model, [RECORDING]) if h.name == "plast.crease")
-    e, finer = setting.episodes[0], (setting.finer.episodes[0], None)
-    worlds = WorldCache(model, (), setting.finer.base)
+    e, finer = setting.episodes[0], (setting.fine_mesh.episodes[0], None)
+    worlds = WorldCache(model, (), setting.fine_mesh.base)
     slack = replace(crease, apply=lambda world, amplitude: world.with_cloth())  # another cloth, which moves alike
     none, some = (run_episode(worlds, e, None, [h], with_grasp_shifts=False, finer=finer) for h in (slack, asked[1]))
     assert (none.fine, none.fine_hypotheses) == (None, set())
@@ -117,7 +117,7 @@ def test_cells_that_are_seen_for_the_first_time_have_slopes_along_nuisances(made
     whole = linearise(model, setting)
     first = whole.bins[0]
     places = torch.arange(len(first.key)) % 5 == 0
-    less = replace(whole, cells=[c.select(~places) if k == 0 else c for k, c in enumerate(whole.bins)])
+    less = replace(whole, bins=[c.select(~places) if k == 0 else c for k, c in enumerate(whole.bins)])
     again = linearise(model, setting, before=less).bins[0]
     grasps = len(GraspOffset().initial_shape_modes(model.base.cloth, setting.episodes[0]))
     assert torch.equal(again.key, first.key)

@@ -38,7 +38,7 @@ def looks(monkeypatch):
         kept = [c.window >= (seen.hidden if at == 0.0 else 0) for c in cells]
         cells = [c.select(k) for c, k in zip(cells, kept, strict=True)]
         numerics = [n[k] for n, k in zip(there.linearisation.mesh_differences, kept, strict=True)]
-        return replace(there.linearisation, cells=cells, numerics=numerics, hypotheses=list(hypotheses))
+        return replace(there.linearisation, bins=cells, mesh_differences=numerics, hypotheses=list(hypotheses))
 
     def asked_about(here, model, setting, hypotheses, progress):
         seen.append((float(model.point[0]), len(hypotheses)))
@@ -139,8 +139,8 @@ def test_a_twin_takes_over_what_the_parameter_did():
     there = toys.fitted(toys.evidence(slopes, 1, ["twin"], torch.tensor([0.0, 0.0]).double(), 0), std=0.05)
     sheet = replace(there.model.parameters[0], value=math.exp)
     model = replace(there.model, parameters=(sheet,)).at_point(torch.tensor([math.log(1.2)]).double())
-    twin = toys.hypothesis("twin", twin=sheet.name)
-    found = add_cause(replace(there, model=model, evidence=replace(there.linearisation, hypotheses=[twin])), twin)
+    twin = toys.hypothesis("twin", equivalent_parameter=sheet.name)
+    found = add_cause(replace(there, model=model, linearisation=replace(there.linearisation, hypotheses=[twin])), twin)
     amplitude, coordinate = found.amplitudes[0], float(found.coordinates[0])
     assert amplitude + coordinate == pytest.approx(0.2, abs=0.1)
     assert abs(coordinate) < 0.05 < 0.1 < amplitude
@@ -158,7 +158,7 @@ def test_cells_that_the_base_model_had_not_keep_their_nuisances():
     """They would err by noise alone, however late the clock may be."""
     here = toys.fitted(toys.evidence(toys.smooth(1, 2), 1, [], TRUTH, 0)).linearisation
     later = [c.select(c.window > 0) for c in here.bins]
-    known = replace(here, cells=[c._replace(jacobian=2 * c.jacobian) for c in later])
+    known = replace(here, bins=[c._replace(jacobian=2 * c.jacobian) for c in later])
     for own, held, like in zip(here.bins, use_nuisance_slopes(here, known).bins, known.bins, strict=True):
         new = own.window == 0
         assert torch.equal(held.jacobian[new], own.jacobian[new])

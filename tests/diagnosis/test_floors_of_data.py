@@ -12,7 +12,8 @@ from torchcloth import recordings as rec
 from torchcloth.diagnosis import build_base_model
 from torchcloth.diagnosis.data.dataset import prepare_data
 from torchcloth.diagnosis.data.replicate_floor import estimate_replicate_floor, find_replicate_pairs
-from torchcloth.diagnosis.inference.bifurcations import FIRST, _perturb_initial_shape, _select_discontinuous, drop_bins
+from torchcloth.diagnosis.decide.criteria import CRITERIA
+from torchcloth.diagnosis.inference.bifurcations import _perturb_initial_shape, _select_discontinuous, drop_bins
 from torchcloth.diagnosis.inference.comparison import HeldOutPrediction
 from torchcloth.meshes import topology
 
@@ -75,9 +76,9 @@ def test_first_shapes_are_off_by_smooth_fields_along_the_normal_there_and_back()
     assert (off[0] - off[2]).norm() > 0.5 * off[0].norm()
     edges = torch.as_tensor(topology.find_edges(model.base.cloth.mesh.faces)[0])
     for field in (off[0], off[2]):
-        assert float(field.square().sum(1).mean().sqrt()) == pytest.approx(FIRST)
-        assert float(field[:, 1].square().mean().sqrt()) == pytest.approx(FIRST, rel=0.01)  # the sheet hangs in x and z
-        assert float((field[edges[:, 0]] - field[edges[:, 1]]).square().sum(1).mean().sqrt()) < FIRST
+        assert float(field.square().sum(1).mean().sqrt()) == pytest.approx(CRITERIA.bifurcation.initial_shape_rms_m)
+        assert float(field[:, 1].square().mean().sqrt()) == pytest.approx(CRITERIA.bifurcation.initial_shape_rms_m, rel=0.01)  # the sheet hangs in x and z
+        assert float((field[edges[:, 0]] - field[edges[:, 1]]).square().sum(1).mean().sqrt()) < CRITERIA.bifurcation.initial_shape_rms_m
 
 
 def test_a_cell_that_does_not_follow_its_slope_is_left_out():

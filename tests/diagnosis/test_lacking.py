@@ -62,7 +62,7 @@ def between_meshes(difference):
     """3 mm RMS that nothing explains, and so much between both meshes."""
     ev = toys.evidence(SLOPES, 2, NAMES, torch.tensor([0.0, 0.0, 0.9]).double(), 0)
     rough = [torch.full_like(c.value, difference) for c in ev.bins]
-    return measure_lack_of_fit(toys.fitted(replace(ev, numerics=rough)), MOTIONS)
+    return measure_lack_of_fit(toys.fitted(replace(ev, mesh_differences=rough)), MOTIONS)
 
 
 def test_numerics_are_expected_to_leave_their_share():
@@ -82,11 +82,11 @@ def test_where_most_motions_fold_apart_what_is_held_out_says_how_much_is_mended(
     """Three of four motions are put right; of two that are judged one."""
     wrong, right = (toys.evidence(SLOPES, 2, NAMES, torch.tensor([0.0, 0.0, a]).double(), 0) for a in (3.0, 0.0))
     rough = [torch.full_like(c.value, 0.03 if k < folded else 0.0) for k, c in enumerate(wrong.bins)]
-    start = toys.fitted(replace(wrong, numerics=rough))
-    end = toys.fitted(replace(wrong, cells=[*right.bins[:3], wrong.bins[3]], numerics=rough))
+    start = toys.fitted(replace(wrong, mesh_differences=rough))
+    end = toys.fitted(replace(wrong, bins=[*right.bins[:3], wrong.bins[3]], mesh_differences=rough))
     assert backward_elimination.fraction_explained(start, end, MOTIONS) == pytest.approx(share, abs=0.1)
     assert backward_elimination.fraction_explained(
-        start, toys.fitted(replace(right, numerics=rough)), MOTIONS
+        start, toys.fitted(replace(right, mesh_differences=rough)), MOTIONS
     ) == pytest.approx(1.0, abs=0.1)
 
 
@@ -94,7 +94,7 @@ def test_where_all_motions_fold_apart_more_is_no_mending():
     """Nothing is judged to be lacking then, neither before nor after."""
     worse, wrong = (toys.evidence(SLOPES, 2, NAMES, torch.tensor([0.0, 0.0, a]).double(), 0) for a in (6.0, 1.0))
     rough = [torch.full_like(c.value, 0.03) for c in wrong.bins]
-    start, end = (toys.fitted(replace(e, numerics=rough)) for e in (wrong, worse))
+    start, end = (toys.fitted(replace(e, mesh_differences=rough)) for e in (wrong, worse))
     assert not has_lack_of_fit(end, MOTIONS)
     assert backward_elimination.fraction_explained(start, end, MOTIONS) < 0
 
@@ -106,7 +106,10 @@ def test_how_much_is_mended_is_counted_on_cells_that_both_fits_have():
     cells = [c._replace(value=torch.where(elsewhere, 0.05, c.value)) for c in right.bins]
     met = [c.select(~elsewhere) for c in wrong.bins]
     numerics = [n[~elsewhere] for n in wrong.mesh_differences]
-    start, end = toys.fitted(replace(wrong, cells=met, numerics=numerics)), toys.fitted(replace(right, cells=cells))
+    start, end = (
+        toys.fitted(replace(wrong, bins=met, mesh_differences=numerics)),
+        toys.fitted(replace(right, bins=cells)),
+    )
     assert compare_misfit(measure_lack_of_fit(start, MOTIONS), measure_lack_of_fit(end, MOTIONS)) < 0
     assert backward_elimination.fraction_explained(start, end, MOTIONS) > 0.9
 
@@ -186,7 +189,7 @@ def test_the_worst_stretch_is_told_and_what_the_others_leave():
 def test_motions_that_fit_are_asked_about_causes_where_others_do_not(monkeypatch, lacking, gains, said):
     """Where none fits, none is asked; a motion that is out of order has no vote."""
     asked = []
-    end = SimpleNamespace(noise=None, evidence=None)
+    end = SimpleNamespace(noise=None, linearisation=None)
     rows = [row(name, 10.0 if name in lacking else 1.0, 1.0) for name in ("a", "b", "a")]
     monkeypatch.setattr(backward_elimination, "measure_lack_of_fit", lambda *_: rows)
     monkeypatch.setattr(backward_elimination, "put_on_common_noise", lambda *both: both)
@@ -194,7 +197,7 @@ def test_motions_that_fit_are_asked_about_causes_where_others_do_not(monkeypatch
     monkeypatch.setattr(backward_elimination, "select_episodes", lambda p, which: asked.append((p[1], which)))
     monkeypatch.setattr(backward_elimination, "compare", lambda *_: None)
     monkeypatch.setattr(backward_elimination, "is_worthwhile", lambda _: gains)
-    steps = [SimpleNamespace(best=SimpleNamespace(alone={"c"}))]
+    steps = [SimpleNamespace(candidate=SimpleNamespace(sole_informative_motion={"c"}))]
     assert backward_elimination.supported_only_by_misfit_motions("start", end, steps, ["a", "b", "a"]) == said  # type: ignore[arg-type]
     fit = [k for k, name in enumerate(["a", "b", "a"]) if name not in lacking]
     assert asked == ([(["c"], fit)] * 2 if fit else [])

@@ -270,11 +270,11 @@ def test_the_bases_metres_hardly_depend_on_what_it_is_compared_with(made, tmp_pa
         path = dx.save_model(tmp_path / f"{name}-{amplitude}.tcm", base.with_hypothesis(by[name], amplitude), blank)
         found.append(dx.confirm(folder / "base.tcm", path, [seen]))
     for f in found:
-        assert f.whole.before == pytest.approx(found[0].whole.before, rel=0.03)
+        assert f.total_gain.before == pytest.approx(found[0].total_gain.before, rel=0.03)
         assert f.motions["fast"].before == pytest.approx(found[0].motions["fast"].before, rel=0.03)
-    assert found[0].whole.after < found[1].whole.after < 0.9 * found[1].whole.before
+    assert found[0].total_gain.after < found[1].total_gain.after < 0.9 * found[1].total_gain.before
     assert (found[0].confirmed, found[2].confirmed) == (True, False)
-    assert found[1].whole.density > 0, "a third of it: by one short episode not beyond doubt"
+    assert found[1].total_gain.log_density > 0, "a third of it: by one short episode not beyond doubt"
     assert all(f.floor < 1e-3 for f in found), "half a millimetre a point, of which a cell has several"
 
 

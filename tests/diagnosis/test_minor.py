@@ -25,7 +25,7 @@ HEM = ("mass.hem", 0.02, 0.39 * RELEVANT_FRACTION * 0.02)
 
 
 def candidate(name, typical, amplitude, **options):
-    return SimpleNamespace(hypothesis=toys.hypothesis(name, typical, **options), amplitude=amplitude, row=None)
+    return SimpleNamespace(hypothesis=toys.hypothesis(name, typical, **options), amplitude=amplitude, score=None)
 
 
 def ended(best, *rivals):
@@ -71,9 +71,9 @@ def test_what_slopes_cannot_tell_from_a_cause_might_have_to_matter_too(monkeypat
     found = ended(("contact.aniso", -0.5, 0.41), EXTRINSIC)
     (step,), mu = found.accepted, toys.hypothesis("contact.mu", 0.2)
     step.candidate.hypothesis = replace(step.candidate.hypothesis, structurally_equivalent=kin)
-    like = SimpleNamespace(hypothesis=mu, amplitude=asked, gain=1.0)
+    like = SimpleNamespace(hypothesis=mu, amplitude=asked, chi2=1.0)
     monkeypatch.setattr(search, "find_confounded", lambda before, row, amplitude, others: others)
-    found = replace(found, steps=[replace(step, screened=[like])])
+    found = replace(found, accepted=[replace(step, scores=[like])])
     assert (found.causes, found.minor) == ((found.accepted, []) if named else ([], found.accepted))
     if not named:
         told = _describe_minor(found, found.accepted[0])
@@ -87,7 +87,7 @@ def test_a_rival_that_joins_the_model_beside_a_cause_is_none_any_more():
     other = candidate(*BIAS)
     model = WorldModel(None, (), toys.torch.zeros(0), (*found.end.model.accepted, other.hypothesis), (0.01, BIAS[2]))  # type: ignore[arg-type]
     second = AcceptedCause(other, None, [other], [], [], None, None)  # type: ignore[arg-type]
-    both = replace(found, end=SimpleNamespace(model=model), steps=[*found.accepted, second])  # type: ignore[arg-type]
+    both = replace(found, end=SimpleNamespace(model=model), accepted=[*found.accepted, second])  # type: ignore[arg-type]
     assert [h.name for h, _ in found.equivalents(found.accepted[0])] == [
         "obs.depth_scale",
         "obs.depth_bias",
@@ -98,12 +98,12 @@ def test_a_rival_that_joins_the_model_beside_a_cause_is_none_any_more():
 
 @pytest.mark.parametrize("doubtful", [True, False])
 def test_what_may_matter_is_not_called_adequate(doubtful):
-    told = _decide(SimpleNamespace(screened=[]), [], lacking=False, stable=True, doubtful=doubtful)
+    told = _decide(SimpleNamespace(scores=[]), [], lacking=False, stable=True, doubtful=doubtful)
     assert told == ("inconclusive" if doubtful else "adequate")
 
 
 def test_what_brings_another_along_is_no_rival_of_it_where_nothing_else_is_left():
-    drag, wind = candidate("air.drag_n", 1.2, 1.2), candidate("air.wind[y]", 0.3, 0.01, brings="air.drag_n")
+    drag, wind = candidate("air.drag_n", 1.2, 1.2), candidate("air.wind[y]", 0.3, 0.01, implies="air.drag_n")
     assert not _predicts_as_well(wind, None, drag)  # type: ignore[arg-type]
 
 
@@ -113,8 +113,8 @@ def test_what_brings_another_along_is_no_rival_of_it_where_nothing_else_is_left(
 )
 def test_wind_that_does_not_matter_is_not_named_for_the_drag_that_it_brings(amplitude, density, named):
     """Unless it predicts clearly better all the same."""
-    drag, wind = candidate("air.drag_n", 1.2, 1.2), candidate("air.wind[y]", 0.3, amplitude, brings="air.drag_n")
-    drag.gain, wind.gain = SimpleNamespace(density=density), SimpleNamespace(density=1477.0)
+    drag, wind = candidate("air.drag_n", 1.2, 1.2), candidate("air.wind[y]", 0.3, amplitude, implies="air.drag_n")
+    drag.gain, wind.gain = SimpleNamespace(log_density=density), SimpleNamespace(log_density=1477.0)
     found = [c.hypothesis.name for c in drop_implied([drag, wind])]  # type: ignore[list-item]
     assert found == (named or ["air.drag_n", "air.wind[y]"])
     assert drop_implied([wind]) == [wind]  # type: ignore[list-item]
@@ -134,10 +134,10 @@ def test_wind_that_does_not_matter_is_not_named_for_the_drag_that_it_brings(ampl
 )
 def test_what_predicts_better_and_motions_disagree_about_is_a_rival(monkeypatch, name, amplitude, over, ci95, open_):
     brings = "air.drag_n" if name == "air.wind[y]" else ""
-    better, best = candidate(name, 1.2, amplitude, brings=brings), candidate("air.linear", 2.0, 1.7)
-    better.gain = best.predicted = None
-    monkeypatch.setattr(candidates, "is_worthwhile", lambda _: True)
-    monkeypatch.setattr(candidates, "compare", lambda *_: SimpleNamespace(density=over, ci95=ci95))
+    better, best = candidate(name, 1.2, amplitude, implies=brings), candidate("air.linear", 2.0, 1.7)
+    better.gain = best.prediction = None
+    monkeypatch.setattr(candidates, "is_worthwhile", lambda *_: True)
+    monkeypatch.setattr(candidates, "compare", lambda *_: SimpleNamespace(log_density=over, log_density_ci95=ci95))
     assert _predicts_clearly_better(better, None, best) == open_  # type: ignore[arg-type]
 
 
@@ -153,20 +153,22 @@ def test_what_predicts_better_and_motions_disagree_about_is_a_rival(monkeypatch,
 )
 def test_what_was_brought_along_takes_the_place_of_what_brought_it(monkeypatch, left, over, passed, named):
     """Where hardly any wind is left, and the drag alone predicts about as well and better than its placebos."""
-    drag, wind = candidate("air.drag_n", 1.2, 1.4), candidate("air.wind[y]", 0.3, 0.2, brings="air.drag_n")
-    drag.fitted, drag.alone = None, set()
+    drag, wind = candidate("air.drag_n", 1.2, 1.4), candidate("air.wind[y]", 0.3, 0.2, implies="air.drag_n")
+    drag.fitted, drag.sole_informative_motion = None, set()
     camera = toys.hypothesis("obs.extrinsic[y]", 4e-3)
     base = WorldModel(None, (), toys.torch.zeros(0), (camera,), (4e-3,))  # type: ignore[arg-type]
-    current = SimpleNamespace(model=base.with_hypothesis(wind.hypothesis, left), evidence=None)
+    current = SimpleNamespace(model=base.with_hypothesis(wind.hypothesis, left), linearisation=None)
     step = AcceptedCause(wind, None, [wind, drag], [drag], [], None, None)  # type: ignore[arg-type]
     monkeypatch.setattr(backward_elimination, "remove_cause", lambda found, name: found.model.without(name))
     monkeypatch.setattr(
-        backward_elimination, "fit", lambda model, *_, **__: SimpleNamespace(model=model, noise=None, evidence=None)
+        backward_elimination,
+        "fit",
+        lambda model, *_, **__: SimpleNamespace(model=model, noise=None, linearisation=None),
     )
     monkeypatch.setattr(backward_elimination, "reweight_by_noise", lambda found, *_: found)
-    monkeypatch.setattr(backward_elimination, "run_permutation_test", lambda *_: SimpleNamespace(passed=passed))
+    monkeypatch.setattr(backward_elimination, "run_permutation_test", lambda *_: SimpleNamespace(is_passed=passed))
     monkeypatch.setattr(backward_elimination, "predictive_gain", lambda *_: over)
-    asked = (SimpleNamespace(names=[]), [camera, wind.hypothesis, drag.hypothesis], lambda _: None)
+    asked = (SimpleNamespace(motions=[]), [camera, wind.hypothesis, drag.hypothesis], lambda _: None)
     end, (then,) = backward_elimination.replace_by_implied(current, [step], *asked)  # type: ignore[arg-type]
     assert then.candidate.hypothesis.name == named
     assert [h.name for h in end.model.accepted] == ["obs.extrinsic[y]", named]
@@ -177,7 +179,7 @@ def test_what_was_brought_along_takes_the_place_of_what_brought_it(monkeypatch, 
 
 
 def test_what_is_there_by_itself_is_not_brought_along_again(monkeypatch):
-    drag, wind = candidate("air.drag_n", 1.2, 1.4), candidate("air.wind[y]", 0.3, 0.2, brings="air.drag_n")
+    drag, wind = candidate("air.drag_n", 1.2, 1.4), candidate("air.wind[y]", 0.3, 0.2, implies="air.drag_n")
     model = WorldModel(None, (), toys.torch.zeros(0), (wind.hypothesis, drag.hypothesis), (0.01, 1.4))  # type: ignore[arg-type]
     steps = [AcceptedCause(c, None, [wind, drag], [], [], None, None) for c in (wind, drag)]  # type: ignore[arg-type]
     monkeypatch.delattr(backward_elimination, "fit")
@@ -188,49 +190,51 @@ def test_what_is_there_by_itself_is_not_brought_along_again(monkeypatch):
 def test_what_cannot_be_simulated_without_a_cause_leaves_it_in(monkeypatch):
     """All work up to there would be lost, and a diagnosis that goes on would end there again."""
     drag, law = candidate("air.drag_n", 1.2, 1.4), candidate("b", 1.0, 1.0)
-    drag.alone = law.alone = set()
+    drag.sole_informative_motion = law.sole_informative_motion = set()
     model = WorldModel(None, (), toys.torch.zeros(0), (drag.hypothesis, law.hypothesis), (1.4, 1.0))  # type: ignore[arg-type]
     steps = [AcceptedCause(c, None, [c], [], [], None, None) for c in (drag, law)]  # type: ignore[arg-type]
-    current = SimpleNamespace(model=model, noise=None, evidence=None)
+    current = SimpleNamespace(model=model, noise=None, linearisation=None)
 
     def diverges(*_):
         raise SimulationDiverged("no such world")
 
     monkeypatch.setattr(backward_elimination, "remove_cause", lambda found, name: found.model.without(name))
-    monkeypatch.setattr(backward_elimination, "accept", lambda *_: False)
+    monkeypatch.setattr(backward_elimination, "accept", lambda *_, **__: False)
     monkeypatch.setattr(backward_elimination, "fit", diverges)
-    asked = (SimpleNamespace(names=[]), [], lambda _: None)
+    asked = (SimpleNamespace(motions=[]), [], lambda _: None)
     assert backward_elimination.drop_redundant(current, steps, *asked) == (current, steps)  # type: ignore[arg-type]
 
 
-def row_of(shows: bool, decision: str = "present", worth: float = 10.0) -> SimpleNamespace:
-    """What screening said of a cause."""
-    return SimpleNamespace(shows=shows, decision=decision, worth=worth)
+def score_of(is_visible: bool, decision: str = "present", expected_gain: float = 10.0) -> SimpleNamespace:
+    """Return what screening said of a cause."""
+    return SimpleNamespace(is_visible=is_visible, decision=decision, expected_gain=expected_gain)
 
 
 @pytest.mark.parametrize(
     ("twin", "row", "low", "worth"),
     [
-        ("p", row_of(True), 1.0, True),
-        ("p", row_of(True), -1.0, False),
-        ("p", row_of(False), 1.0, False),
-        ("", row_of(True), 1.0, False),
-        ("p", row_of(True, worth=60.0), -1.0, True),
-        ("p", row_of(True, "inconclusive", 60.0), -1.0, False),
-        ("p", row_of(False, worth=60.0), -1.0, False),
-        ("", row_of(True, worth=60.0), -1.0, False),
+        ("p", score_of(True), 1.0, True),
+        ("p", score_of(True), -1.0, False),
+        ("p", score_of(False), 1.0, False),
+        ("", score_of(True), 1.0, False),
+        ("p", score_of(True, expected_gain=60.0), -1.0, True),
+        ("p", score_of(True, "inconclusive", 60.0), -1.0, False),
+        ("p", score_of(False, expected_gain=60.0), -1.0, False),
+        ("", score_of(True, expected_gain=60.0), -1.0, False),
     ],
 )
 def test_what_a_parameter_does_already_must_show_beside_its_data_sheet(twin, row, low, worth):
     """It mends nothing beside the parameter that has done it, and hardly predicts better where the sheet is far off."""
     gain = Gain(1e-3, 1e-3, 5.0, (low, 9.0), 0.0, (0.0, 0.0), (1e-3, 1e-3), (0.0, 0.0), low)
     fitted = SimpleNamespace(model=SimpleNamespace(parameters=[toys.parameter("p")]))
-    c = SimpleNamespace(hypothesis=toys.hypothesis("m", twin=twin), fitted=fitted, row=row, bent=0.0)
+    c = SimpleNamespace(
+        hypothesis=toys.hypothesis("m", equivalent_parameter=twin), fit=fitted, score=row, prior_shift=0.0
+    )
     assert candidates.is_improvement(c, gain) == worth  # type: ignore[arg-type]
     assert not candidates.is_worthwhile(gain)
-    assert not candidates.is_improvement(c, gain._replace(density=3.0, least=-2.0))  # type: ignore[arg-type]
-    c.bent = 6.6  # of stiffening, 016 of e9945f3: by slopes beside its prior it need not gain so much
-    assert candidates.is_improvement(c, gain) == (worth or (twin == "p" and row.shows))  # type: ignore[arg-type]
+    assert not candidates.is_improvement(c, gain._replace(log_density=3.0, lower_bound_95=-2.0))  # type: ignore[arg-type]
+    c.prior_shift = 6.6  # of stiffening, 016 of e9945f3: by slopes beside its prior it need not gain so much
+    assert candidates.is_improvement(c, gain) == (worth or (twin == "p" and row.is_visible))  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize(

@@ -12,7 +12,7 @@ from torchcloth import diagnosis as dx
 from torchcloth.diagnosis.data.binning import BIN_SECONDS, BLOCK_NAMES
 from torchcloth.diagnosis.inference.screening import ScoreTest
 from torchcloth.diagnosis.report.fabric_maps import choose_misfit_limit, draw_misfit_maps
-from torchcloth.diagnosis.report.pictures import FARTHEST, draw_residual_maps, draw_scores
+from torchcloth.diagnosis.report.pictures import MAX_SHOWN_AMPLITUDE, draw_residual_maps, draw_scores
 
 
 @pytest.fixture(scope="module")
@@ -30,7 +30,7 @@ def gathered():
 
 def test_a_part_of_the_fabric_has_its_misfit_where_it_lies(gathered):
     evidence, _ = gathered
-    cells, figure = evidence.cells[0], draw_misfit_maps(*gathered)
+    cells, figure = evidence.bins[0], draw_misfit_maps(*gathered)
     tiles = [axis for axis in figure.axes if axis.get_title().endswith(" s")]
     checked = 0
     for k in np.flatnonzero(cells.block == 0):
@@ -50,9 +50,9 @@ def test_a_part_of_the_fabric_has_its_misfit_where_it_lies(gathered):
 
 def test_parts_that_nobody_saw_are_grey(gathered):
     evidence, setting = gathered
-    cells = evidence.cells[0]
+    cells = evidence.bins[0]
     kept = ~((cells.window == 0) & (cells.patch < 3))
-    less = replace(evidence, cells=[type(cells)(*(column[kept] for column in cells))])
+    less = replace(evidence, bins=[type(cells)(*(column[kept] for column in cells))])
     tile = draw_misfit_maps(less, setting).axes[0]
     unseen = tile.images[1].get_array()[..., 3] > 0
     assert 0 < unseen.mean() < 0.15
@@ -61,15 +61,15 @@ def test_parts_that_nobody_saw_are_grey(gathered):
 
 def test_an_episode_without_points_has_an_empty_map_and_markers_do_as_well(gathered):
     evidence, _ = gathered
-    cells = evidence.cells[0]
+    cells = evidence.bins[0]
     blind = type(cells)(*(column[cells.block != 0] for column in cells))
     marked = cells._replace(
-        block=torch.where(cells.block == 0, BLOCK_NAMES.index("markers"), cells.block), patch=3 * cells.patch + 2
+        block=torch.where(cells.block == 0, BLOCK_NAMES.index("markers"), cells.block), channel=3 * cells.patch + 2
     )
 
     def maps(*every):
-        found = SimpleNamespace(evidence=replace(evidence, cells=list(every)))
-        searched = SimpleNamespace(start=found, end=found, steps=[])
+        found = SimpleNamespace(linearisation=replace(evidence, bins=list(every)))
+        searched = SimpleNamespace(start=found, end=found, accepted=[])
         return draw_residual_maps(SimpleNamespace(found=searched, content={"motions": ["a", "b"]}))  # type: ignore[arg-type]
 
     one, two, bar = maps(cells, blind).axes
@@ -85,4 +85,4 @@ def test_amplitudes_beyond_the_picture_are_arrows_at_its_end():
     rows = [ScoreTest(h, a, 0.1, 0.0, 9.0, 1e-3, 0.0, a, 4.5, "present") for a in (1.0, 50.0, -50.0)]
     (axis,) = draw_scores(rows).axes
     arrows = {line.get_marker(): float(line.get_xdata()[0]) for line in axis.lines if line.get_marker() in "<>"}
-    assert arrows == {">": pytest.approx(FARTHEST - 0.05), "<": pytest.approx(0.05 - FARTHEST)}
+    assert arrows == {">": pytest.approx(MAX_SHOWN_AMPLITUDE - 0.05), "<": pytest.approx(0.05 - MAX_SHOWN_AMPLITUDE)}

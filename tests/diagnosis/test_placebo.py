@@ -21,7 +21,7 @@ def with_cause(amplitude: float, seed: int, slopes=SLOPES):
     model = model.with_hypothesis(toys.hypothesis("cause"))
     step, _ = robust_step(found.whitened, model)
     there = found.whitened._replace(value=found.whitened.value + found.whitened.jacobian[:, :3] @ step)
-    return replace(found, model=model.at_point(step), white=reweight(there))
+    return replace(found, model=model.at_point(step), whitened=reweight(there))
 
 
 def test_a_cause_beats_its_placebos():

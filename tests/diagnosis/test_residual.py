@@ -57,7 +57,7 @@ def test_laws_are_asked_about_until_nothing_is_lacking(without_air):
     _, answer = without_air
     found = answer.residual.found
     assert has_lack_of_fit(found.start, found.setting.names)
-    assert bool(found.screened) == has_lack_of_fit(found.end, found.setting.names)
+    assert bool(found.scores) == has_lack_of_fit(found.end, found.setting.names)
 
 
 @pytest.mark.slow

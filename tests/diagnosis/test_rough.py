@@ -35,7 +35,7 @@ def rippling(monkeypatch):
             sides = torch.stack([(up - here) / STEP, (here - down) / STEP], 1)
             sided = c._replace(value=here, jacobian=torch.cat([sides, c.jacobian[:, 1:]], 1))
             cells.append(central_differences(sided, [(0, STEP), (0, -STEP)], 1))
-        return replace(there.linearisation, cells=cells)
+        return replace(there.linearisation, bins=cells)
 
     monkeypatch.setattr(fitting, "linearise", gather)
     return there.model

@@ -23,10 +23,10 @@ def with_cause(change=lambda cells: cells):
     slopes = torch.stack([slopes[..., 0], 10 * slopes[..., 0], slopes[..., 1]], -1)
     slopes[EPISODE, here, 1] += BUMP
     found = toys.fitted(toys.evidence(slopes, 2, [], torch.zeros(2).double(), 0), std=100.0)
-    evidence = replace(found.linearisation, cells=[change(c) for c in found.linearisation.bins])
+    evidence = replace(found.linearisation, bins=[change(c) for c in found.linearisation.bins])
     model = replace(found.model, parameters=found.model.parameters[:1], coordinates=found.model.coordinates[:1])
     model = model.with_hypothesis(toys.hypothesis("cause", 1.0), AMPLITUDE)
-    return replace(found, evidence=evidence, model=model)
+    return replace(found, linearisation=evidence, model=model)
 
 
 def told(found):

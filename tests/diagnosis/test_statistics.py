@@ -65,7 +65,7 @@ def test_single_stretches_are_surely_no_gain():
     """Of episodes of 0.4 s or less nothing is known of how their stretches scatter."""
     found = asked([0.3, 0.0, 0.0, 0.0, 0.0])
     short = [p._replace(window=0 * p.window) for p in (predict_as_given(found), predict_held_out(found, list("abcd")))]
-    assert compare(*short, 0.0).density > 0
+    assert compare(*short, 0.0).log_density > 0
     assert compare(*short, 0.0).least == -math.inf
     assert (
         -math.inf
@@ -146,11 +146,11 @@ def test_the_slow_error_of_depths_is_found_and_is_no_error_of_places():
         memory = torch.linalg.cholesky(torch.exp(-(times[:, None] - times).abs() / CRITERIA.noise.slow_error_time_s))
         off = size * (memory @ torch.randn(len(times), generator=rng).double())[c.window]
         ray = torch.cos(10 * c.rest_position[:, 0])
-        cells.append(c._replace(ray=ray, value=c.value + ray * off))
-    noise = fit_noise(replace(ev, cells=cells))
+        cells.append(c._replace(depth_slope=ray, value=c.value + ray * off))
+    noise = fit_noise(replace(ev, bins=cells))
     assert noise.depth_level == pytest.approx(size, rel=0.4)
     assert float(noise.levels[0]) == pytest.approx(toys.SLOW, rel=0.35)
-    unaware = fit_noise(replace(ev, cells=[c._replace(ray=torch.zeros_like(c.ray)) for c in cells]))
+    unaware = fit_noise(replace(ev, bins=[c._replace(depth_slope=torch.zeros_like(c.depth_slope)) for c in cells]))
     assert unaware.depth_level == 0, "nothing is known of a camera"
     assert float(unaware.levels[0]) > 1.3 * float(noise.levels[0])
 
@@ -210,11 +210,13 @@ def test_numerics_widen_the_error():
 
 def test_what_a_fitted_parameter_does_as_well_is_known_by_its_prior_alone():
     found = asked([0.0, 0.0, 0.7, 0.0, 0.0])
-    hypotheses = [toys.hypothesis("a", twin="p1"), *found.linearisation.hypotheses[1:]]
-    found = replace(found, evidence=replace(found.linearisation, hypotheses=hypotheses))
+    hypotheses = [toys.hypothesis("a", equivalent_parameter="p1"), *found.linearisation.hypotheses[1:]]
+    found = replace(found, linearisation=replace(found.linearisation, hypotheses=hypotheses))
     assert row(found, "a").decision == "unresolvable"
     far = replace(found, model=found.model.at_point(torch.tensor([0.0, 4 * 0.5]).double()))
-    stranger = replace(far, evidence=replace(far.linearisation, hypotheses=[toys.hypothesis("a"), *hypotheses[1:]]))
+    stranger = replace(
+        far, linearisation=replace(far.linearisation, hypotheses=[toys.hypothesis("a"), *hypotheses[1:]])
+    )
     apart = ("hypothesis", "size")
     alike = [{k: v for k, v in row(f, "a")._asdict().items() if k not in apart} for f in (far, stranger)]
     assert alike[0] == alike[1], "asked about as any other"
@@ -225,12 +227,14 @@ def test_beside_a_parameter_that_its_prior_holds_its_twin_asks_for_what_both_wou
     same = SLOPES.clone()
     same[..., 2] = same[..., 1]
     found = asked([0.0, 0.0, 0.7, 0.0, 0.0], slopes=same, std=0.05)
-    twins = [toys.hypothesis("a", twin="p1"), *found.linearisation.hypotheses[1:]]
-    found = replace(found, evidence=replace(found.linearisation, hypotheses=twins))
+    twins = [toys.hypothesis("a", equivalent_parameter="p1"), *found.linearisation.hypotheses[1:]]
+    found = replace(found, linearisation=replace(found.linearisation, hypotheses=twins))
     step, _ = gauss_newton_step(found.whitened, found.model)
     cells = [c._replace(value=c.value + c.jacobian[:, :2] @ step) for c in found.linearisation.bins]
-    evidence = replace(found.linearisation, cells=cells)
-    there = replace(found, model=found.model.at_point(step), evidence=evidence, white=whiten(evidence, found.noise))
+    evidence = replace(found.linearisation, bins=cells)
+    there = replace(
+        found, model=found.model.at_point(step), linearisation=evidence, whitened=whiten(evidence, found.noise)
+    )
     both = there.whitened.jacobian[:, :3]
     prior = torch.diag(torch.tensor([0.05**-2, 0.05**-2, 0.0]).double())
     at = torch.nn.functional.pad(there.model.point, (0, 1))
@@ -244,7 +248,7 @@ def test_beside_a_parameter_that_its_prior_holds_its_twin_asks_for_what_both_wou
 def test_what_is_rough_is_noise_of_its_stretch():
     ev = toys.evidence(SLOPES, 2, ["a", "b", "c"], torch.zeros(5).double(), 0)
     rough = 3e-3 * (ev.bins[0].window == 2)
-    cells = [ev.bins[0]._replace(rough=rough), *ev.bins[1:]]
+    cells = [ev.bins[0]._replace(roughness=rough), *ev.bins[1:]]
     level = torch.full((len(KINDS),), toys.SLOW).double()
     none = torch.zeros(len(rough), 0).double()
     plain, wide = (Noise(level).covariance(c[0], none, none[0]) for c in (ev.bins, cells))
@@ -291,16 +295,16 @@ def test_more_scatter_within_cells_is_no_gain():
     ev = toys.evidence(SLOPES, 2, NAMES, torch.zeros(5).double(), 3)
     cells = [
         c._replace(
-            spread=1.1 * c.row_std,
+            row_std=1.1 * c.row_std,
             count=c.count - 1,
-            rough=c.roughness + 1e-4,
-            ray=c.depth_slope + 0.2,
+            roughness=c.roughness + 1e-4,
+            depth_slope=c.depth_slope + 0.2,
             time=c.time + 0.01,
-            place=1.1 * c.rest_position,
+            rest_position=1.1 * c.rest_position,
         )
         for c in ev.bins
     ]
-    groups, one, other = ["x", "y", "x", "y"], toys.fitted(ev), toys.fitted(replace(ev, cells=cells))
+    groups, one, other = ["x", "y", "x", "y"], toys.fitted(ev), toys.fitted(replace(ev, bins=cells))
     like = [reweight_by_noise(found, one.noise, one.linearisation) for found in (one, other)]
     first, same, more = (
         predict_held_out(found, groups) for found in (*like, reweight_by_noise(other, one.noise, other.linearisation))
@@ -312,15 +316,17 @@ def test_more_scatter_within_cells_is_no_gain():
 def test_models_that_meet_other_cells_are_compared_on_those_that_both_meet():
     """The same residuals are no gain, whichever of the two has met fewer of them."""
     ev = toys.evidence(SLOPES, 2, NAMES, torch.zeros(5).double(), 3)
-    rough = replace(ev, cells=[c._replace(rough=1e-3 * torch.rand(len(c.value))) for c in ev.bins])
+    rough = replace(ev, bins=[c._replace(roughness=1e-3 * torch.rand(len(c.value))) for c in ev.bins])
     fewer = [c.select(slice(5, None)) for c in rough.bins]
     less = replace(
-        ev, cells=[c._replace(spread=2 * c.row_std) for c in fewer], numerics=[n[5:] for n in ev.mesh_differences]
+        ev,
+        bins=[c._replace(row_std=2 * c.row_std) for c in fewer],
+        mesh_differences=[n[5:] for n in ev.mesh_differences],
     )
     for own, taken in zip(ev.bins, use_noise_inputs(ev, less).bins, strict=True):
         assert torch.equal(taken.key, own.key[5:])
         assert torch.equal(taken.row_std, 2 * own.row_std[5:])
-    groups, one, other = ["x", "y", "x", "y"], toys.fitted(rough), toys.fitted(replace(less, cells=fewer))
+    groups, one, other = ["x", "y", "x", "y"], toys.fitted(rough), toys.fitted(replace(less, bins=fewer))
     for both in ((one, other), (other, one)):
         first, second = (predict_held_out(found, groups) for found in put_on_common_noise(*both))
         assert compare(first, second, 1e-3).log_density == pytest.approx(0.0, abs=1e-9)
@@ -329,8 +335,10 @@ def test_models_that_meet_other_cells_are_compared_on_those_that_both_meet():
 def test_an_episode_without_a_cell_says_nothing():
     ev = toys.evidence(SLOPES, 2, NAMES, torch.zeros(5).double(), 3)
     none = ev.bins[0].select(slice(0))
-    empty = replace(ev, cells=[none, *ev.bins[1:]], numerics=[ev.mesh_differences[0][:0], *ev.mesh_differences[1:]])
-    rest = replace(ev, cells=ev.bins[1:], numerics=ev.mesh_differences[1:], stds=ev.nuisance_stds[1:])
+    empty = replace(
+        ev, bins=[none, *ev.bins[1:]], mesh_differences=[ev.mesh_differences[0][:0], *ev.mesh_differences[1:]]
+    )
+    rest = replace(ev, bins=ev.bins[1:], mesh_differences=ev.mesh_differences[1:], nuisance_stds=ev.nuisance_stds[1:])
     noise = fit_noise(empty)
     assert torch.equal(noise.levels, fit_noise(rest).levels)
     assert torch.equal(whiten(empty, noise).value, whiten(rest, noise).value)
@@ -342,7 +350,7 @@ def test_an_episode_without_a_cell_says_nothing():
     gain = compare(first, first, 1e-3)  # of a motion alone
     assert math.isnan(gain.rms_before)
     assert (gain.log_density, gain.log_density_ci95) == (0.0, (0.0, 0.0))
-    forces = replace(ev, cells=[c._replace(block=torch.full_like(c.block, FORCE_BLOCK)) for c in ev.bins])
+    forces = replace(ev, bins=[c._replace(block=torch.full_like(c.block, FORCE_BLOCK)) for c in ev.bins])
     with pytest.raises(InvalidInput, match="no place on the cloth"):
         compute_noise_floor(forces, noise)
 
@@ -425,7 +433,7 @@ def test_two_that_were_fitted_are_alike_where_what_lies_between_them_is_within_t
         cells = [c._replace(value=c.value + far * c.jacobian[:, 3]) for c in found.linearisation.bins]
         fewer = [c.select(slice(1, None)) for c in cells]  # cells that only one of them has do not count
         numerics = [n[1:] for n in found.linearisation.mesh_differences]
-        return replace(found, evidence=replace(found.linearisation, cells=fewer, numerics=numerics))
+        return replace(found, linearisation=replace(found.linearisation, bins=fewer, mesh_differences=numerics))
 
     for louder in (1.0, 3.0):  # by the noise that is given, not by that of the fits
         noise = Noise(found.noise.levels * louder)
@@ -450,7 +458,7 @@ def test_a_single_stretch_of_time_confirms_nothing():
     first = predict_as_given(blank)
     short = select_episodes(first, [0])
     short = HeldOutPrediction(*(column[first.window[first.episode == 0] < 2] for column in short))
-    better = short._replace(value=0.5 * short.residual, white=0.5 * short.whitened)
+    better = short._replace(residual=0.5 * short.residual, whitened=0.5 * short.whitened)
     gain = compare(short, better, 0.0)
     assert gain.log_density > 0
     assert gain.log_density_ci95[0] == gain.log_density_ci95[1]

@@ -90,7 +90,7 @@ def test_causes_with_which_positions_are_hardly_better_predicted_are_none(
 ):
     """Though each did better when it was accepted, with the noise of then."""
     one = found(0.1)
-    whole = SimpleNamespace(before=1e-3, after=after, explained=explained, mended=(4e-4, pulls))
+    whole = SimpleNamespace(before=1e-3, after=after, explained_fraction=explained, rms_removed=(4e-4, pulls))
     row = SimpleNamespace(hypothesis=CAUSE)
     first = AcceptedCause(
         Candidate(row, one, None, None, set(), 0.0, restores_prior=relieves), None, [], [], [], one, None
@@ -103,7 +103,7 @@ def test_causes_with_which_positions_are_hardly_better_predicted_are_none(
     monkeypatch.setattr(search, "has_lack_of_fit", lambda *_: lacking)
     monkeypatch.setattr(search, "_drop_new_bifurcations", lambda start, current, setting, _: (start, current, setting))
     monkeypatch.setattr(search, "_compute_total_gain", lambda *_: whole)
-    _, steps, _ = search._chain(one, SimpleNamespace(names=["a"]), [CAUSE], lambda _: None, 4, first)  # type: ignore[arg-type]
+    _, steps, _ = search._chain(one, SimpleNamespace(motions=["a"]), [CAUSE], lambda _: None, 4, first)  # type: ignore[arg-type]
     assert steps == ([first] if kept else [])
 
 
@@ -125,9 +125,9 @@ def test_the_next_cause_is_looked_for_from_both_or_from_the_better_one(monkeypat
     monkeypatch.setattr(search, "fraction_explained", lambda *_: 1.0)
     monkeypatch.setattr(search, "has_lack_of_fit", lambda *_: False)
     monkeypatch.setattr(
-        search, "_compute_total_gain", lambda *_: SimpleNamespace(before=1.0, after=0.5, explained=0.75)
+        search, "_compute_total_gain", lambda *_: SimpleNamespace(before=1.0, after=0.5, explained_fraction=0.75)
     )
-    end, _, _ = search._chain(strained, SimpleNamespace(names=["a"]), [CAUSE], lambda _: None, 4, first)  # type: ignore[arg-type]
+    end, _, _ = search._chain(strained, SimpleNamespace(motions=["a"]), [CAUSE], lambda _: None, 4, first)  # type: ignore[arg-type]
     ((current, begun),) = looked
     assert current is end is (anew if better else strained)
     assert [model for _, model in begun] == ([anew.model] if better else [strained.model, anew.model])
@@ -136,7 +136,7 @@ def test_the_next_cause_is_looked_for_from_both_or_from_the_better_one(monkeypat
 @pytest.mark.parametrize("ahead", [0.0, CRITERIA.search.min_refit_gain + 1])
 def test_causes_are_doubted_again_where_all_are_fitted_on(monkeypatch, ahead):
     """A fit that still has far to go may take back what a cause was accepted for."""
-    far, near = replace(found(0.1), ahead=ahead), found(0.1)
+    far, near = replace(found(0.1), expected_gain=ahead), found(0.1)
     row = SimpleNamespace(hypothesis=CAUSE)
     first = AcceptedCause(Candidate(row, far, None, None, set(), 0.0), None, [], [], [], far, None)  # type: ignore[arg-type]
     doubted, fits = [], iter([far, far, near, near])  # fitted, then asked about the other causes
@@ -150,9 +150,9 @@ def test_causes_are_doubted_again_where_all_are_fitted_on(monkeypatch, ahead):
     monkeypatch.setattr(search, "fraction_explained", lambda *_: 1.0)
     monkeypatch.setattr(search, "has_lack_of_fit", lambda *_: False)
     monkeypatch.setattr(
-        search, "_compute_total_gain", lambda *_: SimpleNamespace(before=1.0, after=0.5, explained=0.75)
+        search, "_compute_total_gain", lambda *_: SimpleNamespace(before=1.0, after=0.5, explained_fraction=0.75)
     )
-    end, _, _ = search._chain(far, SimpleNamespace(names=["a"]), [CAUSE], lambda _: None, 4, first)  # type: ignore[arg-type]
+    end, _, _ = search._chain(far, SimpleNamespace(motions=["a"]), [CAUSE], lambda _: None, 4, first)  # type: ignore[arg-type]
     assert doubted == ([far, near] if ahead else [far])
     assert end is doubted[-1]
 
@@ -172,14 +172,14 @@ def test_where_nothing_is_lacking_a_cause_from_the_data_sheet_must_surely_gain(
 ):
     """The fit has made up for half an effect, and nulls' causes promise something as well."""
     start, tried = found(0.1), []
-    gain = SimpleNamespace(least=surely)
+    gain = SimpleNamespace(lower_bound_95=surely)
     first = AcceptedCause(Candidate(None, start, None, gain, set(), 0.0), None, [], [], [], start, None)  # type: ignore[arg-type]
     monkeypatch.setattr(search, "has_lack_of_fit", lambda *_: lacking)
     monkeypatch.setattr(search, "screen", lambda f: [])
     monkeypatch.setattr(search, "afresh", lambda *a: tried.append(a[-1]) or [])
     monkeypatch.setattr(search, "evaluate_candidates", lambda *_: first)
     monkeypatch.setattr(search, "_chain", lambda *a: (start, [a[-1]], None))
-    _, steps, _ = search._anew(start, SimpleNamespace(names=[*motions]), [CAUSE], lambda _: None)  # type: ignore[arg-type]
+    _, steps, _ = search._anew(start, SimpleNamespace(motions=[*motions]), [CAUSE], lambda _: None)  # type: ignore[arg-type]
     assert steps == ([first] if named else [])
     assert tried == ([] if motions == "aab" else [0.0 if lacking else CRITERIA.screening.min_expected_gain])
 
@@ -211,7 +211,7 @@ def test_what_one_motion_alone_tells_must_surely_gain(monkeypatch, motions, alon
     """No other motion has predicted it; of two, the other one tells little of what is usual."""
     monkeypatch.setattr(candidates, "is_improvement", lambda *_: True)
     monkeypatch.setattr(candidates, "accept", lambda *_: True)
-    gain, row = SimpleNamespace(least=surely), SimpleNamespace(hypothesis=CAUSE)
+    gain, row = SimpleNamespace(lower_bound_95=surely), SimpleNamespace(hypothesis=CAUSE)
     predicted = SimpleNamespace(episode=torch.arange(len(motions)))
     found = Candidate(row, None, predicted, gain, alone, 2.0)  # type: ignore[arg-type]
     assert candidates._useful(found, motions) == useful
@@ -228,8 +228,8 @@ def test_where_what_predicts_best_is_too_large_to_be_believed_more_are_tried(mon
 
     def likely(current, setting, begun, progress):
         tried.append(begun)
-        gain = SimpleNamespace(density=50.0)
-        return [SimpleNamespace(hypothesis=CAUSE, amplitude=amplitude, gain=gain, row=None, fitted=found(0.1))]
+        gain = SimpleNamespace(log_density=50.0)
+        return [SimpleNamespace(hypothesis=CAUSE, amplitude=amplitude, gain=gain, score=None, fit=found(0.1))]
 
     def enough(_):
         raise Enough
@@ -248,7 +248,7 @@ def test_where_what_predicts_best_is_too_large_to_be_believed_more_are_tried(mon
 def test_further_steps_are_kept_unless_they_predict_worse_than_a_cause(first, then, predicts, kept):
     """A loose grip that ended at nothing predicted by its slopes alone, 48 against 36."""
     fits = {
-        name: SimpleNamespace(name=name, amplitude=amplitude, gain=SimpleNamespace(density=density))
+        name: SimpleNamespace(name=name, amplitude=amplitude, gain=SimpleNamespace(log_density=density))
         for name, amplitude, density in (("first", first, 50.0), ("then", then, predicts))
     }
     assert candidates._better(*fits.values()).name == kept  # type: ignore[arg-type]
@@ -294,16 +294,18 @@ def test_cells_that_jump_with_a_cause_are_left_out_where_nothing_else_is_lacking
     start = search.drop_bins(whole, first)
     best = Candidate(SimpleNamespace(hypothesis=CAUSE), start, None, None, set(), 0.0)  # type: ignore[arg-type]
     step = AcceptedCause(best, None, [], [], [], start, None)  # type: ignore[arg-type]
-    monkeypatch.setattr(search, "fit", lambda model, setting, *_, **__: search.drop_bins(whole, setting.unstable))
+    monkeypatch.setattr(
+        search, "fit", lambda model, setting, *_, **__: search.drop_bins(whole, setting.bifurcating_bins)
+    )
     monkeypatch.setattr(search, "unstable", lambda *_: second)
-    less = lambda f: len(whole.linearisation.bins[0].key) - len(f.evidence.cells[0].key)  # noqa: E731
+    less = lambda f: len(whole.linearisation.bins[0].key) - len(f.linearisation.bins[0].key)  # noqa: E731
     monkeypatch.setattr(search, "has_lack_of_fit", lambda f, _: less(f) in lacking)
     monkeypatch.setattr(search, "screen", lambda f: [])
     monkeypatch.setattr(search, "evaluate_candidates", lambda *_: None)
     monkeypatch.setattr(search, "drop_redundant", lambda current, steps, *_: (current, steps))
     monkeypatch.setattr(search, "fraction_explained", lambda *_: float(kept))
     monkeypatch.setattr(
-        search, "_compute_total_gain", lambda *_: SimpleNamespace(before=1.0, after=0.5, explained=0.75)
+        search, "_compute_total_gain", lambda *_: SimpleNamespace(before=1.0, after=0.5, explained_fraction=0.75)
     )
     asked = Asked(["a"] * toys.EPISODES, first)
     found = search._chain(start, asked, [], lambda _: None, 4, step)  # type: ignore[arg-type]

@@ -37,7 +37,7 @@ def test_without_forces_mass_is_said_to_be_unknown():
     assert told("points", "edges")
     assert not told("points", "force", "torque")
     assert not told()  # nothing was simulated
-    heavier = {"effect": "mass.density", "amplitude": 0.1, "unit": "-", "ci95": [0.05, 0.15]}
+    heavier = {"effect": "mass.log_density", "amplitude": 0.1, "unit": "-", "ci95": [0.05, 0.15]}
     assert not told("points", given=[heavier])  # the stiffness of the data sheet says so
 
 
@@ -160,11 +160,11 @@ def test_what_would_have_the_wrong_sign_is_told_from_what_is_small():
 def test_what_cannot_be_seen_is_told_from_what_a_fitted_number_does():
     rows = [
         {"effect": name, "smallest_detectable": least, "unit": "-"}
-        for name, least in (("air.drag_t", 0.05), ("mass.density", None))
+        for name, least in (("air.drag_t", 0.05), ("mass.log_density", None))
     ]
     said = summary("adequate", unresolvable=rows)
     assert "Cannot be seen in these data: air.drag_t." in said
-    assert "Does nothing here, or what a fitted number does as well: mass.density." in said
+    assert "Does nothing here, or what a fitted number does as well: mass.log_density." in said
 
 
 def test_the_gain_is_told_with_its_intervals():
@@ -202,15 +202,17 @@ def test_a_missing_force_is_a_pressure_at_a_place():
 
 
 def test_ripples_that_would_hide_a_lack_of_fit_are_warned_of():
-    model = SimpleNamespace(strained=[], accepted=(), amplitudes=(), base=SimpleNamespace(), parameters=())
+    model = SimpleNamespace(strained_parameters=[], accepted=(), amplitudes=(), base=SimpleNamespace(), parameters=())
     model.base.cloth = SimpleNamespace(effects={"bending": None})
     fitted = SimpleNamespace(model=model)
-    found = SimpleNamespace(start=fitted, end=fitted, setting=SimpleNamespace(episodes=[]), repeats=1, left_out=0.0)
-    found.impossible = found.withdrawn = found.causes = found.screened = ()
-    found.whole = None
+    found = SimpleNamespace(start=fitted, end=fitted, data=SimpleNamespace(episodes=[]), repeats=1, left_out=0.0)
+    found.not_simulated = found.withdrawn = found.causes = found.scores = ()
+    found.total_gain = None
 
     def warned(expected, stable=True):
-        row = SimpleNamespace(motion="turn", kind="points", seen=True, stable=stable, lacking=False, expected=expected)
+        row = SimpleNamespace(
+            motion="turn", kind="points", seen=True, stable=stable, is_significant=False, expected=expected
+        )
         return [text for text in collect_warnings(found, ["turn"] * 8, [row]) if "ripples" in text]  # type: ignore[arg-type]
 
     (text,) = warned(1.5 * CRITERIA.report.max_expected_rms_m)

@@ -97,7 +97,9 @@ def test_no_effect_may_take_the_place_of_the_catalogues(world):
         class Mine(effects.MassDamping):
             """A law of one's own."""
 
-        register(Hypothesis("my.own", "1/s", 1.0, lambda w, a, own=Mine, key=name: w.with_cloth({key: own(a)})))
+        register(
+            Hypothesis("my.own", "1/s", 1.0, lambda w, a, n_coordinates=Mine, key=name: w.with_cloth({key: own(a)}))
+        )
         try:
             with pytest.raises(InvalidInput, match=f"named '{name}', as the catalogue calls one of its own"):
                 list_hypotheses(model, recordings)

@@ -93,7 +93,7 @@ def test_air_and_hem_do_what_their_names_say(made):
 def test_cells_know_what_a_longer_depth_does_to_them(made):
     model, setting = made
     e, by = setting.episodes[0], {h.name: h for h in list_hypotheses(model, [RECORDING])}
-    cells = lambda world: bin_residuals(world.frames(e), None, e, setting.sheet, setting.rest)  # noqa: E731
+    cells = lambda world: bin_residuals(world.frames(e), None, e, setting.surface, setting.rest)  # noqa: E731
     base, off = cells(model.world()), cells(model.world([(by["obs.depth_bias"], 1e-4)]))
     seen = base.block < FORCE_BLOCK
     assert torch.equal(base.key, off.key)
@@ -104,7 +104,7 @@ def test_cells_know_what_a_longer_depth_does_to_them(made):
         base.depth_slope.square().mean().sqrt()
     )
     unplaced = bin_residuals(
-        model.world().frames(e), None, replace(e, camera_position=None), setting.sheet, setting.rest
+        model.world().frames(e), None, replace(e, camera_position=None), setting.surface, setting.rest
     )
     assert not unplaced.depth_slope.any(), "no camera, or several"
 
