@@ -118,7 +118,9 @@ def test_is_needed():
 
     plain, inside = seconds(nullcontext()), seconds(dense_tangents())
     if plain < 40e-6 * 60 and plain < 3 * inside:
-        pytest.skip(f"torch {torch.__version__} multiplies mixed operands fast by itself: dense_tangents can be retired")
+        pytest.skip(
+            f"torch {torch.__version__} multiplies mixed operands fast by itself: dense_tangents can be retired"
+        )
     assert plain > 3 * inside
 
 
@@ -159,6 +161,8 @@ def test_jvp_of_numbers_in_float32():
         return torch.func.functional_call(cloth, {name: raw}, (state, motion, t)).x[-1].square().sum()
 
     raw = cloth.material.poisson_ratio.raw.detach()
-    own = raw.clone().requires_grad_()
-    loss(own).backward()
-    assert float(torch.func.jvp(loss, (raw,), (torch.ones_like(raw),))[1]) == pytest.approx(float(own.grad), rel=1e-3)
+    parameter = raw.clone().requires_grad_()
+    loss(parameter).backward()
+    assert float(torch.func.jvp(loss, (raw,), (torch.ones_like(raw),))[1]) == pytest.approx(
+        float(parameter.grad), rel=1e-3
+    )

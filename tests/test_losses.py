@@ -105,10 +105,10 @@ def test_weights_are_barycentric_and_chunks_change_nothing(vertices, points):
 def test_both_searches_find_the_same_places(vertices, points, dtype):
     """Of two triangles that share the place, rounding decides."""
     points, corners = points.to(dtype), vertices.to(dtype)[FACES]
-    found = search.find_nearest_triangles(points, corners, 10**6), search._search(points, corners)
-    one, other = ((weights[..., None] * corners[face]).sum(1) for face, weights in found)
+    result = search.find_nearest_triangles(points, corners, 10**6), search._search(points, corners)
+    one, other = ((weights[..., None] * corners[face]).sum(1) for face, weights in result)
     torch.testing.assert_close(one, other, rtol=0, atol=20 * torch.finfo(dtype).eps)
-    assert float((found[0][0] == found[1][0]).double().mean()) > 0.9
+    assert float((result[0][0] == result[1][0]).double().mean()) > 0.9
 
 
 def test_no_place_is_near_to_what_is_not_finite(vertices, points):
@@ -199,20 +199,20 @@ def test_residuals_of_a_flat_sheet():
         [0.15, 0.07, 0.01],  # above an inner edge: not beyond
     ])  # fmt: skip
     hits = find_closest_points(points, flat, FACES)
-    along, beside = residuals(points, flat, hits)
+    along, tangential = residuals(points, flat, hits)
     torch.testing.assert_close(along, torch.tensor([0.01, -0.02, 0.03, 0.0, 0.01]), rtol=0, atol=1e-15)
-    torch.testing.assert_close(beside, torch.tensor([0.0, 0.0, 0.04, 0.05, 0.0]), rtol=0, atol=1e-15)
+    torch.testing.assert_close(tangential, torch.tensor([0.0, 0.0, 0.04, 0.05, 0.0]), rtol=0, atol=1e-15)
     assert hits.is_beyond_edge.tolist() == [False, False, True, True, False]
 
 
 def test_points_beyond_pull_the_edge_outwards_and_points_inside_do_not_pull_it_back():
     flat = torch.as_tensor(MESH.vertices).clone().requires_grad_()
     outside, inside = torch.tensor([[0.34, 0.07, 0.0]]), torch.tensor([[0.25, 0.07, 0.0]])
-    _, beside = residuals(outside, flat, find_closest_points(outside, flat, FACES))
-    (gradient,) = torch.autograd.grad(beside.sum(), flat)
+    _, tangential = residuals(outside, flat, find_closest_points(outside, flat, FACES))
+    (gradient,) = torch.autograd.grad(tangential.sum(), flat)
     assert float(gradient[:, 0].sum()) == pytest.approx(-1.0)  # moving the edge out by 1 shortens the distance by 1
-    along, beside = residuals(inside, flat, find_closest_points(inside, flat, FACES))
-    (gradient,) = torch.autograd.grad((along + beside).sum(), flat)
+    along, tangential = residuals(inside, flat, find_closest_points(inside, flat, FACES))
+    (gradient,) = torch.autograd.grad((along + tangential).sum(), flat)
     assert float(gradient[:, :2].abs().max()) == 0.0
 
 
@@ -246,8 +246,8 @@ def test_chamfer_distances_of_points_on_the_sheet(vertices):
 def test_residuals_have_finite_gradients_inside_the_sheet(vertices):
     x = vertices.clone().requires_grad_()
     points = vertices[FACES].mean(1)
-    along, beside = residuals(points, x, find_closest_points(points, vertices, FACES))
-    (gradient,) = torch.autograd.grad((along + beside).sum(), x)
+    along, tangential = residuals(points, x, find_closest_points(points, vertices, FACES))
+    (gradient,) = torch.autograd.grad((along + tangential).sum(), x)
     assert bool(torch.isfinite(gradient).all())
 
 
@@ -256,9 +256,9 @@ def test_residuals_have_finite_gradients_on_the_edge(point):
     """Exactly on the rim or straight above it: the distance beside the sheet is zero."""
     flat = torch.as_tensor(MESH.vertices).clone().requires_grad_()
     points = torch.tensor([point])
-    along, beside = residuals(points, flat, find_closest_points(points, flat, FACES))
-    (gradient,) = torch.autograd.grad((along + beside).sum(), flat)
-    assert float(beside.detach()) == 0.0
+    along, tangential = residuals(points, flat, find_closest_points(points, flat, FACES))
+    (gradient,) = torch.autograd.grad((along + tangential).sum(), flat)
+    assert float(tangential.detach()) == 0.0
     assert bool(torch.isfinite(gradient).all())
 
 
@@ -284,16 +284,16 @@ def test_arrays_are_taken_as_recordings_and_meshes_hold_them():
     assert torch.equal(chamfer_to_surface(cloud, x, mesh.faces), wanted)
     assert torch.equal(chamfer_to_surface(cloud, mesh.vertices, mesh.faces), wanted)
     hits = find_closest_points(cloud, mesh.vertices, mesh.faces)
-    found, expected = residuals(cloud, mesh.vertices, hits), residuals(torch.as_tensor(cloud), x, hits)
-    assert all(map(torch.equal, found, expected))
+    result, expected = residuals(cloud, mesh.vertices, hits), residuals(torch.as_tensor(cloud), x, hits)
+    assert all(map(torch.equal, result, expected))
     assert torch.equal(chamfer_to_vertices(cloud, x), chamfer_to_vertices(torch.as_tensor(cloud), x))
 
 
 def test_gradients_by_torch_func_are_those_of_backward():
     mesh = tc.meshes.rectangle(0.3, 0.2, resolution=(4, 3))
     x, faces = torch.as_tensor(mesh.vertices), torch.as_tensor(mesh.faces)
-    cloud, own = x + torch.tensor([0.01, 0.0, 0.02]), x.clone().requires_grad_()
-    (wanted,) = torch.autograd.grad(chamfer_to_surface(cloud, own, faces), own)
+    cloud, parameter = x + torch.tensor([0.01, 0.0, 0.02]), x.clone().requires_grad_()
+    (wanted,) = torch.autograd.grad(chamfer_to_surface(cloud, parameter, faces), parameter)
     torch.testing.assert_close(torch.func.grad(lambda x: chamfer_to_surface(cloud, x, faces))(x), wanted)
 
 
@@ -307,8 +307,8 @@ def test_edges_of_large_meshes_have_numbers_of_their_own():
 def test_a_triangle_without_area_gives_no_nan():
     x = torch.tensor([[0.0, 0, 0], [1, 0, 0], [2, 0, 0], [0, 1, 0]], dtype=torch.float64, requires_grad=True)
     faces, point = torch.tensor([[0, 1, 2]]), torch.tensor([[0.5, 0.0, 0.2]], dtype=torch.float64)
-    along, beside = residuals(point, x, find_closest_points(point, x, faces))
-    (along.sum() + beside.sum()).backward()
+    along, tangential = residuals(point, x, find_closest_points(point, x, faces))
+    (along.sum() + tangential.sum()).backward()
     assert torch.isfinite(along).all()
-    assert torch.isfinite(beside).all()
+    assert torch.isfinite(tangential).all()
     assert torch.isfinite(x.grad).all()

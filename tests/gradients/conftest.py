@@ -48,7 +48,10 @@ def pressed():
     torch.manual_seed(0)
     mesh = tc.meshes.rectangle(0.2, 0.2, resolution=(4, 4))
     cloth = tc.Cloth(
-        mesh, tc.materials.AEP(1e5, 0.3, 1e5, 5e4, cone=0.3), 0.2, contact=tc.Contact(everywhere=True, free_compression=0.1)
+        mesh,
+        tc.materials.AEP(1e5, 0.3, 1e5, 5e4, cone=0.3),
+        0.2,
+        contact=tc.Contact(everywhere=True, free_compression=0.1),
     )
     dt = 0.4 * cloth.stable_step()
     x = cloth.rest_state().x + 4e-3 * torch.randn(16, 3)

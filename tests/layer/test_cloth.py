@@ -29,7 +29,7 @@ def turning(end, angle, knots):
 
 
 @pytest.fixture
-def held():
+def gripped():
     return sheet(boundaries={"hand": tc.boundaries.Grasp([0, 1]), "table": tc.boundaries.Plane()})
 
 
@@ -65,13 +65,13 @@ def held():
         ({"hand": trajectory(pose=torch.eye(4).long().repeat(2, 1, 1))}, r"pose; got torch\.int64"),
     ],
 )
-def test_refuses_motion(held, motion, message):
+def test_refuses_motion(gripped, motion, message):
     with pytest.raises(InvalidInput, match=message):
-        held(held.rest_state(), motion, times=[0.0, 0.1])
+        gripped(gripped.rest_state(), motion, times=[0.0, 0.1])
 
 
-def test_accepts_turns_of_90_degrees_in_steps(held):
-    held(held.rest_state(), {"hand": turning(1.0, math.radians(170), 3)}, times=[0.0, 0.002])
+def test_accepts_turns_of_90_degrees_in_steps(gripped):
+    gripped(gripped.rest_state(), {"hand": turning(1.0, math.radians(170), 3)}, times=[0.0, 0.002])
 
 
 @pytest.mark.parametrize("times", [[0.0], [0.0, 0.0], [0.1, 0.0], [0.0, math.nan], [], torch.tensor([0.0, 2.0, 1.0])])
@@ -170,7 +170,10 @@ def test_refuses_boundaries(boundary, message):
             "contact spacing; got 1e-07 m, for which",
         ),
         (lambda: tc.Contact(spacing=1e-300).resolve(tc.meshes.rectangle(1, 1)), "contact spacing; got 1e-300 m"),
-        (lambda: tc.Contact(spacing=5.0).build_grid(tc.meshes.rectangle(1, 1)), "contact spacing; got 5 m; expected at most"),
+        (
+            lambda: tc.Contact(spacing=5.0).build_grid(tc.meshes.rectangle(1, 1)),
+            "contact spacing; got 5 m; expected at most",
+        ),
         (
             lambda: tc.Contact(subdivisions=10**9).resolve(tc.meshes.rectangle(1, 1)),
             "contact subdivisions; got 1000000000",
@@ -240,13 +243,13 @@ def test_the_friction_of_a_table_alone_may_be_batched(engine):
     """Sliding down it from one state."""
     table = lambda mu: {"table": tc.boundaries.Plane(friction=mu)}  # noqa: E731
     effects = {"gravity": tc.effects.Gravity((3.0, 0.0, -9.0))}
-    coefficients, found = torch.tensor([[0.1], [0.5]]), []
+    coefficients, result = torch.tensor([[0.1], [0.5]]), []
     for mu in (coefficients, *coefficients.flatten().tolist()):
         cloth = sheet(effects=effects, boundaries=table(mu))
         cloth.engine = engine
-        found.append(cloth(cloth.rest_state(), times=(0.0, 0.05)).x)
-    assert float((found[1] - found[2]).detach().norm()) > 1e-3
-    torch.testing.assert_close(found[0], torch.stack(found[1:]), rtol=0, atol=1e-6)
+        result.append(cloth(cloth.rest_state(), times=(0.0, 0.05)).x)
+    assert float((result[1] - result[2]).detach().norm()) > 1e-3
+    torch.testing.assert_close(result[0], torch.stack(result[1:]), rtol=0, atol=1e-6)
 
 
 @pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16])
@@ -302,10 +305,10 @@ def test_the_stable_step_is_stable(contact):
 
 def test_beyond_the_limit_a_membrane_blows_up():
     """The bound is no more than 1.6 times too careful on this mesh: 2 / omega x 1.6 diverges."""
-    from torchcloth.dynamics.stability import STEP_SAFETY_FACTOR
+    from torchcloth.dynamics.stability import STABLE_STEP_OVER_LINEAR_LIMIT
 
     cloth = sheet()
-    state, dt = shaken(cloth), 1.6 * cloth.stable_step() / STEP_SAFETY_FACTOR
+    state, dt = shaken(cloth), 1.6 * cloth.stable_step() / STABLE_STEP_OVER_LINEAR_LIMIT
     with torch.no_grad():
         grown, _ = substep.rollout(cloth.build_model(), state, dt, {}, 100)
     moved = (grown.x - cloth.rest_state().x).abs().max()
@@ -441,19 +444,19 @@ def test_the_motion_is_an_input_and_nothing_is_remembered():
 
 
 @pytest.mark.parametrize("rate", [math.nan, math.inf, -1.0])
-def test_settling_needs_a_finite_rate(held, rate):
+def test_settling_needs_a_finite_rate(gripped, rate):
     with pytest.raises(InvalidInput, match="rate"):
-        held.settle(held.rest_state(), {"hand": trajectory()}, rate=rate)
+        gripped.settle(gripped.rest_state(), {"hand": trajectory()}, rate=rate)
 
 
-def test_trajectories_cover_the_times_also_far_from_zero(held):
+def test_trajectories_cover_the_times_also_far_from_zero(gripped):
     begin = 1.7e9
     motion = {"hand": tc.Trajectory(begin + torch.tensor([0.0, 1.0]), torch.eye(4).repeat(2, 1, 1), torch.ones(2) > 0)}
-    held(held.rest_state(), motion, (begin + 0.5, begin + 0.51))
+    gripped(gripped.rest_state(), motion, (begin + 0.5, begin + 0.51))
     with pytest.raises(InvalidInput, match="to cover"):
-        held(held.rest_state(), motion, (begin + 999.0, begin + 999.1))
+        gripped(gripped.rest_state(), motion, (begin + 999.0, begin + 999.1))
     with pytest.raises(InvalidInput, match="to cover"):
-        held.settle(held.rest_state(), motion, start=begin + 50.0, duration=0.1)
+        gripped.settle(gripped.rest_state(), motion, start=begin + 50.0, duration=0.1)
 
 
 @pytest.mark.parametrize("engine", ["reference", "fused"])
@@ -476,9 +479,9 @@ def test_cloth_that_has_far_to_go_is_not_settled_and_told():
     with torch.no_grad(), pytest.warns(UserWarning, match=r"settle: after 0.3 s .* still moves at 0\.\d+ m/s"):
         cloth.settle(cloth.rest_state(), still)
     along = tc.Directions(state=cloth.rest_state().map(lambda field: field[None]))
-    with pytest.warns(UserWarning, match=r"settle: after 0.3 s .* still moves") as told:
+    with pytest.warns(UserWarning, match=r"settle: after 0.3 s .* still moves") as reported:
         cloth.sensitivities(cloth.rest_state(), still, (0.0, 1e-3), along=along, settle=0.3)
-    assert {warning.filename for warning in told} == {__file__}
+    assert {warning.filename for warning in reported} == {__file__}
     with torch.no_grad(), warnings.catch_warnings():
         warnings.simplefilter("error")
         cloth.settle(cloth.rest_state(), still, duration=4.0, rate=5.0)

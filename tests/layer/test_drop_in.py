@@ -25,11 +25,11 @@ class Learned(AbstractEffect):
     def coefficients(self):
         return None
 
-    def force(self, c, now):
-        return 0.02 * self.network(now.v + now.x)
+    def force(self, c, inputs):
+        return 0.02 * self.network(inputs.v + inputs.x)
 
 
-def held(effects=None, engine="auto"):
+def gripped(effects=None, engine="auto"):
     cloth = sheet(effects=effects, boundaries={"hand": tc.boundaries.Grasp.corner("upper-left")})
     cloth.engine = engine
     t = torch.linspace(0.0, 0.04, 5)
@@ -46,7 +46,7 @@ def loss_of(cloth, motion, **options):
 
 
 def test_a_step_below_zero_is_refused_by_name_and_can_be_taken_back():
-    cloth, motion = held({"bending": tc.effects.Bending(1e-4), "damping": tc.effects.MassDamping(1e-4)})
+    cloth, motion = gripped({"bending": tc.effects.Bending(1e-4), "damping": tc.effects.MassDamping(1e-4)})
     optimiser = torch.optim.Adam(cloth.parameters(), lr=1e-2)
     loss_of(cloth, motion).backward()
     optimiser.step()
@@ -59,7 +59,7 @@ def test_a_step_below_zero_is_refused_by_name_and_can_be_taken_back():
 
 
 def test_a_state_is_the_callers():
-    cloth, _ = held()
+    cloth, _ = gripped()
     cloth.rest_state().x.add_(0.5)
     assert float(cloth.rest_state().x[:, 2].abs().max()) == 0.0
     assert float(torch.as_tensor(cloth.mesh.vertices)[:, 2].abs().max()) == 0.0
@@ -93,7 +93,7 @@ def test_a_checkpoint_carries_what_is_learned_and_no_scene():
 
 
 def test_modules_with_a_cloth_can_be_gone_through():
-    cloth, _ = held()
+    cloth, _ = gripped()
     seen = []
     nn.Sequential(nn.Linear(2, 2), cloth).apply(lambda part: seen.append(type(part)))
     assert tc.boundaries.Grasp in seen
@@ -101,14 +101,16 @@ def test_modules_with_a_cloth_can_be_gone_through():
 
 @pytest.mark.parametrize("engine", ENGINES)
 def test_parts_that_come_later_are_bound_as_the_first_ones_are(engine):
-    cloth, motion = held({"gravity": tc.effects.Gravity()}, engine)
+    cloth, motion = gripped({"gravity": tc.effects.Gravity()}, engine)
     late = sheet(effects={"gravity": tc.effects.Gravity()})
     late.engine = engine
     late = late.double()
     late.boundaries["hand"] = tc.boundaries.Grasp.corner("upper-left")
     late.effects["bending"] = tc.effects.Bending(1e-5)
     cloth.effects["bending"] = tc.effects.Bending(1e-5)
-    first, second = (own(own.rest_state(), motion, times=(0.0, 0.04)).x for own in (cloth, copy.deepcopy(late)))
+    first, second = (
+        parameter(parameter.rest_state(), motion, times=(0.0, 0.04)).x for parameter in (cloth, copy.deepcopy(late))
+    )
     assert torch.equal(first, second)
     with pytest.raises(InvalidInput, match="effects: table; got Plane"):
         late.effects["table"] = tc.boundaries.Plane()
@@ -123,33 +125,33 @@ def test_parts_that_come_later_are_bound_as_the_first_ones_are(engine):
 def test_gradients_that_are_computed_again_are_of_the_parameters_of_the_call(engine):
     """Those of ``functional_call`` are gone when the backward pass comes."""
     torch.manual_seed(0)
-    cloth, motion = held({"learned": Learned()}, engine)
+    cloth, motion = gripped({"learned": Learned()}, engine)
     weights = {k: (1.5 * p.detach()).requires_grad_() for k, p in cloth.named_parameters() if "network" in k}
-    found = []
+    result = []
     for checkpoint in (True, False):
         options = {"times": (0.0, 0.04), "checkpoint": checkpoint}
         x = functional_call(cloth, weights, (cloth.rest_state(), motion), options).x[-1]
-        found.append(torch.autograd.grad(x.square().sum(), list(weights.values())))
-    torch.testing.assert_close(found[0], found[1], rtol=1e-9, atol=1e-15)
+        result.append(torch.autograd.grad(x.square().sum(), list(weights.values())))
+    torch.testing.assert_close(result[0], result[1], rtol=1e-9, atol=1e-15)
 
 
 @pytest.mark.parametrize("engine", ENGINES)
 def test_what_is_drawn_is_drawn_again(engine):
-    cloth, motion = held({"learned": Learned(nn.Dropout(0.3))}, engine)
-    found, weights = [], list(cloth.effects["learned"].parameters())
+    cloth, motion = gripped({"learned": Learned(nn.Dropout(0.3))}, engine)
+    result, weights = [], list(cloth.effects["learned"].parameters())
     for checkpoint in (True, False):
         torch.manual_seed(3)
-        found.append(torch.autograd.grad(loss_of(cloth, motion, checkpoint=checkpoint), weights))
-    torch.testing.assert_close(found[0], found[1], rtol=1e-9, atol=1e-15)
+        result.append(torch.autograd.grad(loss_of(cloth, motion, checkpoint=checkpoint), weights))
+    torch.testing.assert_close(result[0], result[1], rtol=1e-9, atol=1e-15)
 
 
 @pytest.mark.parametrize("engine", ENGINES)
 def test_gradients_by_torch_func_are_those_of_backward(engine):
-    cloth, motion = held({"gravity": tc.effects.Gravity()}, engine)
+    cloth, motion = gripped({"gravity": tc.effects.Gravity()}, engine)
     x = cloth.rest_state().x
     loss = lambda x: cloth(cloth.state(x), motion, times=(0.0, 0.02)).x[-1].square().sum()  # noqa: E731
-    own = x.clone().requires_grad_()
-    (wanted,) = torch.autograd.grad(loss(own), own)
+    parameter = x.clone().requires_grad_()
+    (wanted,) = torch.autograd.grad(loss(parameter), parameter)
     torch.testing.assert_close(torch.func.grad(loss)(x), wanted, rtol=1e-9, atol=1e-15)
 
 
@@ -158,47 +160,47 @@ def test_gradients_by_torch_func_are_those_of_backward(engine):
 
 @pytest.mark.parametrize("engine", ENGINES)
 def test_slopes_are_the_same_in_inference_mode(engine):
-    cloth, motion = held({"gravity": tc.effects.Gravity()}, engine)
+    cloth, motion = gripped({"gravity": tc.effects.Gravity()}, engine)
     lifted = torch.zeros_like(motion["hand"].pose[None])
     lifted[..., 2, 3] = motion["hand"].t
     along = tc.Directions({"material.youngs_modulus.raw": torch.ones(1)}, motion={"hand": lifted})
     ask = lambda: cloth.sensitivities(cloth.rest_state(), motion, (0.0, 0.04), along=along)[1].x  # noqa: E731
     wanted = ask()
     with torch.inference_mode():
-        found = ask()
+        result = ask()
     assert float(wanted.abs().max()) > 0
-    assert torch.equal(found, wanted)
+    assert torch.equal(result, wanted)
 
 
 def test_autocast_takes_no_digits():
-    cloth, motion = held({"gravity": tc.effects.Gravity()}, "reference")
+    cloth, motion = gripped({"gravity": tc.effects.Gravity()}, "reference")
     cloth, motion = cloth.float(), {"hand": motion["hand"]._replace(pose=motion["hand"].pose.float())}
     arm = tc.robots.load("rizon4", frame="tcp_closed", dtype=torch.float32)
     q = torch.stack([arm.home, arm.home + 0.05])
     ask = lambda: (cloth(cloth.rest_state(), motion, times=(0.0, 0.04)).x, arm(q), arm.jacobian(q))  # noqa: E731
     wanted = ask()
     with torch.autocast("cpu", dtype=torch.bfloat16):
-        found = ask()
-    for a, b in zip(found, wanted, strict=True):
+        result = ask()
+    for a, b in zip(result, wanted, strict=True):
         assert a.dtype == b.dtype
         assert torch.equal(a, b)
 
 
 def test_a_material_of_another_precision_is_cast_by_the_engine():
-    cloth, motion = held(engine="fused")
+    cloth, motion = gripped(engine="fused")
     wanted = loss_of(cloth, motion)
     cloth.material.float()
-    found = loss_of(cloth, motion)
-    assert found.dtype == torch.float64
-    torch.testing.assert_close(found, wanted, rtol=1e-5, atol=0)
-    found.backward()
+    result = loss_of(cloth, motion)
+    assert result.dtype == torch.float64
+    torch.testing.assert_close(result, wanted, rtol=1e-5, atol=0)
+    result.backward()
     assert cloth.material.youngs_modulus.raw.grad.dtype == torch.float32
 
 
 @pytest.mark.parametrize("engine", ENGINES)
 def test_what_is_made_on_the_way_is_made_where_the_cloth_is(engine):
     """Not on a default device: tensors there would be handed to the library as memory that is none."""
-    cloth, motion = held({"gravity": tc.effects.Gravity()}, engine)
+    cloth, motion = gripped({"gravity": tc.effects.Gravity()}, engine)
     arm = tc.robots.load("rizon4")
     faces, q, t = torch.as_tensor(cloth.mesh.faces), torch.stack([arm.home, arm.home + 0.05]), torch.tensor([0.0, 1.0])
     along = tc.Directions({"areal_density.raw": torch.ones(1)})
@@ -213,5 +215,5 @@ def test_what_is_made_on_the_way_is_made_where_the_cloth_is(engine):
 
     wanted = ask()
     with torch.device("meta"):
-        found = ask()
-    torch.testing.assert_close(found, wanted, rtol=0, atol=0)
+        result = ask()
+    torch.testing.assert_close(result, wanted, rtol=0, atol=0)

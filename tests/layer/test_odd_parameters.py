@@ -52,16 +52,16 @@ def test_twist_may_differ_in_a_batch(engine):
 
 @ENGINES
 @pytest.mark.parametrize(("made", "own"), [(torch.float64, torch.float32), (torch.float32, torch.float64)])
-def test_parts_take_the_precision_of_the_cloth(engine, made, own):
+def test_parts_take_the_precision_of_the_cloth(engine, made, parameter):
     before = torch.get_default_dtype()
     try:
         torch.set_default_dtype(made)
         floor = tc.boundaries.Plane((0.0, 0.0, -1e-3), friction=tc.boundaries.Elliptic(0.3, 0.4))
         effects = {"g": tc.effects.Gravity(), "pull": tc.effects.Adhesion(1.0)}
-        torch.set_default_dtype(own)
+        torch.set_default_dtype(parameter)
         out = cloth(effects, engine, {"floor": floor})
         rollout = out(out.rest_state(), times=[0.0, 0.02])
-        assert rollout.x.dtype == rollout.state.v.dtype == own
+        assert rollout.x.dtype == rollout.state.v.dtype == parameter
     finally:
         torch.set_default_dtype(before)
 
@@ -75,15 +75,15 @@ def test_a_law_near_the_edge_of_a_strip_that_is_all_edge():
 
 def test_a_threshold_that_is_no_number_is_refused_by_name():
     slip = tc.effects.GripSlip("hand", 0.1, 0.1)
-    held = cloth({"slip": slip}, boundaries={"hand": tc.boundaries.Grasp([0, 1])})
+    gripped = cloth({"slip": slip}, boundaries={"hand": tc.boundaries.Grasp([0, 1])})
     with torch.no_grad():
         slip.hold.raw.fill_(torch.nan)
     hand = tc.Trajectory(torch.tensor([0.0, 1.0]), torch.eye(4).repeat(2, 1, 1), torch.ones(2, dtype=torch.bool))
     with pytest.raises(InvalidInput, match=r"effects\.slip\.hold\.raw; got NaN"):
-        held(held.rest_state(), {"hand": hand}, times=[0.0, 0.01])
+        gripped(gripped.rest_state(), {"hand": hand}, times=[0.0, 0.01])
     with torch.no_grad():
-        held.areal_density.raw.fill_(torch.nan)
-    assert "16 vertices" in str(held)
+        gripped.areal_density.raw.fill_(torch.nan)
+    assert "16 vertices" in str(gripped)
 
 
 @pytest.mark.parametrize("times", [None, "abc", [[0.0, 1.0]]])

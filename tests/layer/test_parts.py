@@ -59,11 +59,11 @@ def test_a_field_wants_an_effect_that_was_made_with_one():
 def test_a_part_of_another_cloth_is_not_bound_anew():
     bending, hand = tc.effects.Bending(1e-3), tc.boundaries.Grasp.corner("upper-right", radius=1e-3)
     first = sheet(effects={"bending": bending}, boundaries={"hand": hand})
-    held = hand.index.clone()
+    gripped = hand.index.clone()
     for parts in ({"effects": {"bending": bending}}, {"boundaries": {"hand": hand}}):
         with pytest.raises(InvalidInput, match=r"an effect or boundary of another cloth.*copy.deepcopy"):
             sheet(7, **parts)
-    assert torch.equal(first.boundaries["hand"].index, held)
+    assert torch.equal(first.boundaries["hand"].index, gripped)
     sheet(4, effects={"bending": bending})  # the same mesh
     sheet(7, effects={"bending": copy.deepcopy(bending)})
     del first
@@ -116,8 +116,8 @@ class Pull(tc.effects.AbstractEffect):
     def coefficients(self):
         return self.strength.field
 
-    def force(self, c, now):
-        return c * torch.stack([now.v[..., 1], torch.sin(now.x[..., 2]), -now.v[..., 0]], dim=-1)
+    def force(self, c, inputs):
+        return c * torch.stack([inputs.v[..., 1], torch.sin(inputs.x[..., 2]), -inputs.v[..., 0]], dim=-1)
 
 
 @pytest.mark.parametrize("engine", ["reference", "fused"])
@@ -236,8 +236,8 @@ class Named(Pull):
     def coefficients(self):
         return {"k": self.strength.field}
 
-    def force(self, c, now):
-        return super().force(c["k"], now)
+    def force(self, c, inputs):
+        return super().force(c["k"], inputs)
 
 
 @pytest.mark.parametrize("kind", [Pull, Named])
@@ -246,9 +246,9 @@ def test_scenes_differ_in_a_users_own_coefficients(kind):
     pull.strength = tc.PhysicalParameter([[0.05], [0.1]], "N", "nonnegative", name="pull")
     cloth = sheet(effects={"pull": pull})
     v = torch.tensor([0.3, 0.1, -0.1]).expand(16, 3)
-    found = cloth(cloth.state(cloth.rest_state().x, v), times=(0.0, 0.01)).x
-    assert found.shape == (2, 2, 16, 3)
-    assert not torch.equal(found[0], found[1])
+    result = cloth(cloth.state(cloth.rest_state().x, v), times=(0.0, 0.01)).x
+    assert result.shape == (2, 2, 16, 3)
+    assert not torch.equal(result[0], result[1])
 
 
 def test_contact_is_kept_as_it_was_made():

@@ -14,8 +14,8 @@ from torchcloth.meshes import Mesh
 MESH = tc.meshes.rectangle(0.2, 0.2, resolution=(4, 4))
 
 
-def cloth(held=True, **parts):
-    hands = {"hand": tc.boundaries.Grasp.corner("upper-left")} if held else {}
+def cloth(gripped=True, **parts):
+    hands = {"hand": tc.boundaries.Grasp.corner("upper-left")} if gripped else {}
     return tc.Cloth(MESH, tc.materials.AEP(1e4), 0.2, parts, hands, contact=None)
 
 
@@ -40,7 +40,7 @@ def test_places_are_part_of_a_mesh():
 
 
 def test_an_effect_of_a_grip_that_is_not_there_does_not_pass_unnoticed():
-    late = cloth(held=False)
+    late = cloth(gripped=False)
     late.effects["slip"] = tc.effects.GripSlip("hnad")
     with pytest.raises(InvalidInput, match="grasp of effect 'slip'; got 'hnad'"):
         late(late.rest_state(), times=[0.0, 0.01])
@@ -54,18 +54,18 @@ def test_a_woven_material_needs_directions_later_too():
 
 
 def test_who_still_moves_is_not_hidden_by_a_hundred_that_do_not():
-    own = cloth(held=False)
-    x = own.rest_state().x.expand(100, -1, -1).clone()
+    parameter = cloth(gripped=False)
+    x = parameter.rest_state().x.expand(100, -1, -1).clone()
     v = torch.zeros_like(x)
     v[3, :, 2] = 0.5
     with pytest.warns(UserWarning, match="still moves"):
-        own.settle(own.state(x, v), duration=0.01)
+        parameter.settle(parameter.state(x, v), duration=0.01)
 
 
 def test_settling_that_would_never_end_is_refused():
-    own = cloth(held=False)
+    parameter = cloth(gripped=False)
     with pytest.raises(UnstableStep, match="substeps"):
-        own.settle(own.rest_state(), duration=1.0, rate=1e12)
+        parameter.settle(parameter.rest_state(), duration=1.0, rate=1e12)
 
 
 def test_the_longest_piece_counts():
@@ -84,6 +84,6 @@ def test_the_longest_piece_counts():
 
 def test_a_value_is_as_precise_as_what_stores_it():
     torch.set_default_dtype(torch.float32)
-    own = cloth().double()
-    own.material.youngs_modulus.set(5e4)
-    assert float(own.material.youngs_modulus.raw) == math.log(5e4)
+    parameter = cloth().double()
+    parameter.material.youngs_modulus.set(5e4)
+    assert float(parameter.material.youngs_modulus.raw) == math.log(5e4)

@@ -53,7 +53,9 @@ def test_what_fails_is_asked_again():
 def test_equal_motions_are_resolved_once():
     assert sample_trajectory(path(), TIMES) is sample_trajectory(path(), TIMES.clone())
     assert sample_trajectory(path(), TIMES) is not sample_trajectory(path(), TIMES[:-1])
-    assert stationary_motion({"hand": path()}, 0.2, 0.5)["hand"] is stationary_motion({"hand": path()}, 0.2, 0.5)["hand"]
+    assert (
+        stationary_motion({"hand": path()}, 0.2, 0.5)["hand"] is stationary_motion({"hand": path()}, 0.2, 0.5)["hand"]
+    )
 
 
 def test_who_writes_to_a_motion_gets_another():
@@ -85,7 +87,9 @@ def test_every_graph_is_its_own():
         sample_trajectory(motion._replace(pose=pose), TIMES).pose.sum().backward()
         assert pose.grad is not None
         assert pose.grad.abs().sum() > 0
-    moved = torch.func.jvp(lambda p: sample_trajectory(motion._replace(pose=p), TIMES).pose, (motion.pose,), (motion.pose,))[1]
+    moved = torch.func.jvp(
+        lambda p: sample_trajectory(motion._replace(pose=p), TIMES).pose, (motion.pose,), (motion.pose,)
+    )[1]
     assert moved.abs().sum() > 0
 
 

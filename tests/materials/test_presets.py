@@ -58,9 +58,9 @@ def test_si_units():
         "friction": (0.1, 0.6),
     }
     for key, (low, high) in ranges.items():
-        found = [getattr(f, key) for f in presets.load_fabrics().values() if getattr(f, key) is not None]
-        assert found, key
-        assert low < min(found) <= max(found) < high, key
+        result = [getattr(f, key) for f in presets.load_fabrics().values() if getattr(f, key) is not None]
+        assert result, key
+        assert low < min(result) <= max(result) < high, key
 
 
 def test_missing_stiffness_is_named_with_the_remedy():

@@ -30,17 +30,17 @@ def loops(edges):
         near.setdefault(a, []).append(b)
         near.setdefault(b, []).append(a)
     assert {len(n) for n in near.values()} == {2}
-    found = []
+    result = []
     while near:
         start = at = next(iter(near))
         loop, before = [], None
         while not loop or at != start:
             loop.append(at)
             before, at = at, next(n for n in near[at] if n != before)
-        found.append(frozenset(loop))
+        result.append(frozenset(loop))
         for v in loop:
             del near[v]
-    return found
+    return result
 
 
 def angles(rest):
@@ -232,14 +232,16 @@ def test_a_hung_dress_stays_sewn_and_hangs_its_length():
     """Held at the shoulders for a second: weight on the grippers, seams closed, no triangle torn."""
     mesh = tc.meshes.dress(triangles=300)
     x = mesh.vertices[:, [0, 2, 1]] * [1.0, -1.0, 1.0]  # upright
-    held = {side: tc.boundaries.Grasp.at(f"{side} shoulder", radius=0.03) for side in ("left", "right")}
-    cloth = tc.Cloth(mesh, tc.materials.AEP(3e5), 0.2, {"gravity": tc.effects.Gravity()}, boundaries=held, contact=None)
+    gripped = {side: tc.boundaries.Grasp.at(f"{side} shoulder", radius=0.03) for side in ("left", "right")}
+    cloth = tc.Cloth(
+        mesh, tc.materials.AEP(3e5), 0.2, {"gravity": tc.effects.Gravity()}, boundaries=gripped, contact=None
+    )
     pose = torch.eye(4, dtype=torch.get_default_dtype()).expand(2, 4, 4)
-    motion = {side: tc.Trajectory(torch.tensor([0.0, 2.0]), pose, torch.tensor([True, True])) for side in held}
+    motion = {side: tc.Trajectory(torch.tensor([0.0, 2.0]), pose, torch.tensor([True, True])) for side in gripped}
     start = cloth.settle(cloth.state(torch.as_tensor(x, dtype=pose.dtype)), motion, duration=1.0, rate=10.0)
     out = cloth(start, motion, [0.0, 0.05])
     weight = 9.81 * 0.2 * mesh.area.sum()
-    lifted = sum(-float(out.wrench[side][-1, 2].detach()) for side in held)
+    lifted = sum(-float(out.wrench[side][-1, 2].detach()) for side in gripped)
     assert lifted == pytest.approx(weight, rel=0.05)
     assert float(np.ptp(out.x[-1, :, 2].detach().numpy())) == pytest.approx(1.05, rel=0.03)
     edges = out.x[-1].detach().numpy()[mesh.faces]

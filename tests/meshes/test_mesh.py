@@ -134,8 +134,8 @@ def test_a_closed_tube_without_a_pattern():
 def test_nearest_vertices():
     mesh = tc.meshes.rectangle(0.4, 0.3, resolution=(5, 4))
     np.testing.assert_array_equal(mesh.vertices_near_pattern_points([[0.0, 0.0]], 0.01), [0])
-    found = mesh.vertices_near_pattern_points([[0.0, 0.0], [0.4, 0.3]], 0.1)
-    np.testing.assert_array_equal(found, [0, 1, 4, 15, 18, 19])
+    result = mesh.vertices_near_pattern_points([[0.0, 0.0], [0.4, 0.3]], 0.1)
+    np.testing.assert_array_equal(result, [0, 1, 4, 15, 18, 19])
     np.testing.assert_array_equal(mesh.vertices_near_pattern_points([0.2, 0.1], 0.02), [9])
     with pytest.raises(InvalidInput, match=r"nearest: 0\.07071 m"):
         mesh.vertices_near_pattern_points([[0.05, 0.05]], 0.02)
@@ -147,8 +147,8 @@ def test_nearest_vertices():
 )
 def test_corners_are_named_in_pattern_coordinates(corner, uv):
     mesh = tc.meshes.rectangle(0.4, 0.3, resolution=(5, 4))
-    held = tc.boundaries.Grasp.corner(corner).bind(mesh).index
-    np.testing.assert_allclose(mesh.uv[held.numpy()], [uv])
+    gripped = tc.boundaries.Grasp.corner(corner).bind(mesh).index
+    np.testing.assert_allclose(mesh.uv[gripped.numpy()], [uv])
 
 
 def test_load_refuses_what_is_no_mesh(tmp_path):

@@ -54,9 +54,9 @@ def test_what_the_cloth_gains_the_air_loses_along_its_normals():
     n, turn = torch.func.jvp(lambda x: normals(cloth, x), (x,), (v,))
     change = (n * (after.v - v)[faces] + dt * turn * v[faces]).sum(-1, keepdim=True)
     impulse = (EXTRA / 3 * torch.as_tensor(cloth.mesh.area)[:, None, None] * change * n).sum((0, 1))
-    own = (cloth.build_model().mass * (after.v - v)).sum(0)
-    assert own.norm() > 1e3 * (own + impulse).norm()
-    assert (own + impulse).norm() < 1e-12
+    parameter = (cloth.build_model().mass * (after.v - v)).sum(0)
+    assert parameter.norm() > 1e3 * (parameter + impulse).norm()
+    assert (parameter + impulse).norm() < 1e-12
 
 
 @pytest.mark.parametrize("engine", ["reference", "fused"])

@@ -128,8 +128,8 @@ def test_only_affine_deformation_is_free(make):
 def test_frequencies_of_a_free_square_plate():
     """nu = 0.3: lambda = omega a^2 sqrt(rho / B) = 13.47, 19.60, 24.27, 34.80 twice (Leissa 1973). Reached: 1.5 %."""
     mesh = tc.meshes.rectangle(1.0, 1.0, resolution=(21, 21))
-    found = squared_frequencies(tc.effects.Bending(1.0, poisson=0.3).bind(mesh), mesh)[3:8].sqrt()
-    torch.testing.assert_close(found, torch.tensor([13.468, 19.596, 24.270, 34.801, 34.801]), rtol=0.025, atol=0)
+    result = squared_frequencies(tc.effects.Bending(1.0, poisson=0.3).bind(mesh), mesh)[3:8].sqrt()
+    torch.testing.assert_close(result, torch.tensor([13.468, 19.596, 24.270, 34.801, 34.801]), rtol=0.025, atol=0)
 
 
 @pytest.mark.parametrize(("degrees", "share"), [(0, 0.90), (45, 0.85)])
@@ -166,12 +166,12 @@ def narrow(degrees):
     return tc.meshes.Mesh.build(mesh.vertices, mesh.faces, turned)
 
 
-def sag(mesh, bending, held=0.0026):
+def sag(mesh, bending, gripped=0.0026):
     """[V] m, small deflections under 1 N/m^2 with two columns of vertices held; linear, so solved exactly."""
     count = len(mesh.vertices)
     unit = torch.eye(count).unsqueeze(-1).expand(-1, -1, 3)
     Q = -bending.force(bending.coefficients(), EffectInputs(unit, torch.zeros_like(unit), None, None))[..., 0].T
-    free = torch.as_tensor(mesh.vertices[:, 0] > held)
+    free = torch.as_tensor(mesh.vertices[:, 0] > gripped)
     out = torch.zeros(count)
     out[free] = torch.linalg.solve(Q[free][:, free].detach(), share(mesh)[free])
     return out
@@ -183,10 +183,10 @@ def test_cantilevers_of_woven_cloth(degrees, twist):
     """Tip L^4 / (8 B), 1/B = cos^4 / B_warp + sin^4 / B_weft + 2 cos^2 sin^2 / B_twist. Reached: 2.5 %."""
     warp, ratio = 3e-5, 0.4
     mesh = narrow(degrees)
-    found = sag(mesh, tc.effects.Bending(warp, weft_ratio=ratio, twist_ratio=twist).bind(mesh))
+    result = sag(mesh, tc.effects.Bending(warp, weft_ratio=ratio, twist_ratio=twist).bind(mesh))
     c, s = math.cos(math.radians(degrees)), math.sin(math.radians(degrees))
     compliance = (c**4 + s**4 / ratio + 2 * c**2 * s**2 / (twist * ratio**0.5)) / warp
-    tip = found[torch.as_tensor(mesh.vertices[:, 0] > 0.1 - 1e-9)].mean().item()
+    tip = result[torch.as_tensor(mesh.vertices[:, 0] > 0.1 - 1e-9)].mean().item()
     assert tip == pytest.approx(compliance * 0.0975**4 / 8, rel=0.03)
 
 
@@ -361,9 +361,9 @@ def strip(kind, length=0.1, resolution=(21, 5)):
     return tc.meshes.Mesh.build(x, mesh.faces, uv)
 
 
-def cantilever(mesh, stiffness, held=0.0051, **effects):
+def cantilever(mesh, stiffness, gripped=0.0051, **effects):
     """Two columns of vertices are held, so that the strip leaves the clamp without slope at 5 mm."""
-    clamped = np.flatnonzero(mesh.vertices[:, 0] < held).tolist()
+    clamped = np.flatnonzero(mesh.vertices[:, 0] < gripped).tolist()
     cloth = tc.Cloth(
         mesh,
         tc.materials.AEP(1e5, 0.02),

@@ -63,10 +63,14 @@ def test_points_share_impulses_without_losing_momentum():
     some = torch.randn_like(points.interpolate(x)) * (torch.rand(len(points.interpolate(x)), 1) < 0.3)
     alone = torch.zeros_like(some)
     alone[37] = some.abs().amax(0) + 1
-    torch.testing.assert_close(points.interpolate(points.distribute(alone, mass))[37], alone[37])  # one point: exactly as wanted
+    torch.testing.assert_close(
+        points.interpolate(points.distribute(alone, mass))[37], alone[37]
+    )  # one point: exactly as wanted
     same = torch.ones_like(some)
     even = torch.as_tensor(mesh.vertex_area)[:, None]
-    torch.testing.assert_close(points.distribute(same, even), torch.ones_like(x), rtol=0, atol=0.15)  # all alike: nearly
+    torch.testing.assert_close(
+        points.distribute(same, even), torch.ones_like(x), rtol=0, atol=0.15
+    )  # all alike: nearly
     change = points.distribute(alone, mass)
     linear, angular = (mass * change).sum(0), torch.linalg.cross(x, mass * change).sum(0)
     torch.testing.assert_close(angular, torch.linalg.cross(points.interpolate(x)[37], linear))  # it acts at the point

@@ -200,8 +200,8 @@ def test_gradients_of_a_rollout():
         pose = base.pose.clone()
         pose[:, :3, 3] = pose[:, :3, 3] + shift
         motion = {"ball": base._replace(pose=pose)}
-        own = {"boundaries.ball.friction.raw": friction, "boundaries.ball.radius.raw": radius}
-        return functional_call(cloth, own, (cloth.state(x), motion, [0.0, 0.02])).x[-1]
+        parameter = {"boundaries.ball.friction.raw": friction, "boundaries.ball.radius.raw": radius}
+        return functional_call(cloth, parameter, (cloth.state(x), motion, [0.0, 0.02])).x[-1]
 
     ball = cloth.boundaries["ball"]
     inputs = {

@@ -8,7 +8,12 @@ import pytest
 import torch
 
 import torchcloth as tc
-from torchcloth.dynamics.contact import APPROACH_PER_COMPRESSION_SPACINGS, REST_GAP_SPACINGS, COMPRESSION_ONSET_SPACINGS, self_contact
+from torchcloth.dynamics.contact import (
+    APPROACH_PER_COMPRESSION_SPACINGS,
+    COMPRESSION_ONSET_SPACINGS,
+    REST_GAP_SPACINGS,
+    self_contact,
+)
 from torchcloth.dynamics.contact.neighbours import find_overlapping_triangles
 
 SPACING, STIFFNESS, DENSITY = 0.01, 100.0, 0.15  # m, k h [N/m], kg/m^2
@@ -58,7 +63,10 @@ def test_a_sheet_alone_needs_no_grid():
         x[:, 2] = 0.03 * torch.sin(20 * x[:, 0])
         runs.append(cloth(cloth.state(x), times=[0.0, 0.02], dt=1e-4))
     assert torch.equal(runs[0].x, runs[1].x)
-    assert len(self_contact.find_contact_candidates(cloth.build_model(), cloth.build_model().grid, runs[1].x[-1]).active) == 0
+    assert (
+        len(self_contact.find_contact_candidates(cloth.build_model(), cloth.build_model().grid, runs[1].x[-1]).active)
+        == 0
+    )
 
 
 @torch.no_grad()
@@ -75,7 +83,10 @@ def test_only_triangles_near_another_layer_take_part():
         x[over, 2] = 0.014
         return x
 
-    share = [len(self_contact.find_contact_candidates(model, model.grid, folded(at)).active) / len(mesh.faces) for at in (0.2, 0.3)]
+    share = [
+        len(self_contact.find_contact_candidates(model, model.grid, folded(at)).active) / len(mesh.faces)
+        for at in (0.2, 0.3)
+    ]
     assert 0.9 < share[0] < 1.0
     assert 0.45 < share[1] < 0.75
 
@@ -88,14 +99,14 @@ def test_layers_are_found_as_well_far_from_the_origin():
     x, model = torch.as_tensor(mesh.vertices).float(), cloth.build_model()
     x[x[:, 0] > 0.2, 0] = 0.4 - x[x[:, 0] > 0.2, 0]
     x[torch.arange(len(x)) % 41 > 20, 2] = 0.006
-    found = []
+    result = []
     for away in (0.0, 60.0):
         there = x + torch.tensor([away, -away, 0.5 * away]).float()
         layers = self_contact.find_contact_candidates(model, model.grid, there)
-        found.append((len(layers.active), self_contact.initial_directors(model, model.grid, there)))
-    assert found[0][0] == pytest.approx(found[1][0], abs=4)
-    assert found[0][0] > 300
-    torch.testing.assert_close(found[0][1], found[1][1], rtol=0, atol=0.01)
+        result.append((len(layers.active), self_contact.initial_directors(model, model.grid, there)))
+    assert result[0][0] == pytest.approx(result[1][0], abs=4)
+    assert result[0][0] > 300
+    torch.testing.assert_close(result[0][1], result[1][1], rtol=0, atol=0.01)
 
 
 @torch.no_grad()
@@ -249,15 +260,15 @@ def test_large_cells_of_an_uneven_mesh_have_no_holes(cell):
 
 
 @pytest.mark.parametrize(("contact", "told"), [(tc.Contact(), True), (tc.Contact.with_gap(0.01), False)])
-def test_layers_that_do_not_meet_are_told(contact, told):
+def test_layers_that_do_not_meet_are_told(contact, reported):
     """A shirt on a grid as coarse as its mesh: the way round its seams is too short for the layers to be any."""
-    mesh = tc.meshes.shirt(triangles=2000 if not told else 300)
+    mesh = tc.meshes.shirt(triangles=2000 if not reported else 300)
     with warnings.catch_warnings(record=True) as said:
         warnings.simplefilter("always")
         tc.Cloth(mesh, tc.materials.AEP(1e5, 0.3, 5e4), DENSITY, contact=contact)
         tc.Cloth(tc.meshes.rectangle(0.3, 0.3, resolution=(9, 9)), tc.materials.AEP(1e5), DENSITY)
     texts = [str(w.message) for w in said]
-    assert len(texts) == told
+    assert len(texts) == reported
     assert all("lie over another layer do not see it" in text for text in texts)
 
 
@@ -273,9 +284,9 @@ def test_contact_that_costs_a_hundred_times_as_much_is_told():
 def test_what_lies_over_what():
     """Two sheets 1 cm apart, each of whose triangles has some of the other over it; none of its own."""
     cloth, _ = layers(0.01)
-    found = find_overlapping_triangles(cloth.mesh, 0.02)
-    assert len(found)
-    assert ((found[:, 0] < 32) != (found[:, 1] < 32)).all()
+    result = find_overlapping_triangles(cloth.mesh, 0.02)
+    assert len(result)
+    assert ((result[:, 0] < 32) != (result[:, 1] < 32)).all()
     assert not len(find_overlapping_triangles(cloth.mesh, 0.005))
     bent = tc.meshes.rectangle(0.3, 0.3, resolution=(20, 20))
     vertices = bent.vertices.copy()

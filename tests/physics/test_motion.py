@@ -135,16 +135,16 @@ def test_float32_has_room_for_substeps_whatever_the_clock_says(origin):
     t = torch.linspace(0, 0.2, 9, dtype=torch.float64)
     pose = torch.eye(4).repeat(9, 1, 1)
     pose[:, 2, 3] = 0.05 * (1 - torch.cos(20 * t)).float()
-    found = []
+    result = []
     for start in (0.0, origin):
         hand = {"hand": tc.boundaries.Grasp([0, 1])}
         cloth = tc.Cloth(mesh, tc.materials.AEP(1e5, 0.3), 0.2, boundaries=hand, contact=None).float()
         motion = {"hand": tc.Trajectory(start + t, pose, torch.ones(9, dtype=torch.bool))}
         still = cloth.settle(cloth.rest_state(), motion, start=start, duration=0.01)
-        found.append(cloth(still, motion, [start, start + 0.2]))
-    assert found[0].x.dtype == torch.float32
-    torch.testing.assert_close(found[1].v, found[0].v, rtol=1e-3, atol=1e-3)
-    torch.testing.assert_close(found[1].wrench["hand"], found[0].wrench["hand"], rtol=1e-2, atol=1e-4)
+        result.append(cloth(still, motion, [start, start + 0.2]))
+    assert result[0].x.dtype == torch.float32
+    torch.testing.assert_close(result[1].v, result[0].v, rtol=1e-3, atol=1e-3)
+    torch.testing.assert_close(result[1].wrench["hand"], result[0].wrench["hand"], rtol=1e-2, atol=1e-4)
 
 
 def test_a_path_of_one_knot_stands_still():

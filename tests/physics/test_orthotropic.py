@@ -7,7 +7,7 @@ import torch
 from helpers.tension_strips import Strip
 
 import torchcloth as tc
-from torchcloth.dynamics.stability import STEP_SAFETY_FACTOR, StabilityLimits, bound_squared_frequency
+from torchcloth.dynamics.stability import STABLE_STEP_OVER_LINEAR_LIMIT, StabilityLimits, bound_squared_frequency
 from torchcloth.materials import AEP, OrthotropicAEP
 from torchcloth.testing import samples
 
@@ -112,7 +112,7 @@ def isotropic_step(cloth, E, nu, density):
     g = torch.as_tensor(cloth.mesh.shape_gradient)
     zero = torch.zeros_like(g[..., 0])
     B = torch.stack([torch.cat(r, -1) for r in ((g[..., 0], zero), (zero, g[..., 1]), (g[..., 1], g[..., 0]))], -2)
-    return STEP_SAFETY_FACTOR * 2 / (3 / density * torch.linalg.eigvalsh(B.mT @ D @ B).max()).sqrt()
+    return STABLE_STEP_OVER_LINEAR_LIMIT * 2 / (3 / density * torch.linalg.eigvalsh(B.mT @ D @ B).max()).sqrt()
 
 
 def test_isotropic_step_is_what_it_was():
@@ -128,7 +128,7 @@ def test_step_bounds_the_true_frequency(moduli):
     mass = strip.cloth.build_model().mass.detach().repeat_interleave(2)
     omega = torch.linalg.eigvalsh(hessian / (mass[:, None] * mass).sqrt()).max().sqrt()
     share = strip.cloth.stable_step() / (2 / float(omega))
-    assert 0.6 * STEP_SAFETY_FACTOR < share <= STEP_SAFETY_FACTOR
+    assert 0.6 * STABLE_STEP_OVER_LINEAR_LIMIT < share <= STABLE_STEP_OVER_LINEAR_LIMIT
 
 
 def stretched(material, elongation, size=(0.2, 0.04), resolution=(11, 3), density=0.5):
@@ -200,6 +200,10 @@ def test_step_takes_the_stiffest_triangle_of_a_field():
     for warp in (WARP, WARP * field, 100 * WARP):
         material = woven(warp)
         tangents = material.stiffness(material.coefficients())
-        steps.append(StabilityLimits(bound_squared_frequency(gradient, torch.tensor(0.1), tangents, None), 0.0, 0.0).cheapest_step)
+        steps.append(
+            StabilityLimits(
+                bound_squared_frequency(gradient, torch.tensor(0.1), tangents, None), 0.0, 0.0
+            ).cheapest_step
+        )
     assert steps[1] < 0.3 * steps[0]
     assert steps[1] == pytest.approx(steps[2], rel=0.3)

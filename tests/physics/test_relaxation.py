@@ -10,7 +10,7 @@ import torch
 import torchcloth as tc
 from torchcloth.dynamics import substep
 from torchcloth.dynamics.stability import StabilityLimits, stability_limits
-from torchcloth.dynamics.viscous_stages import MAX_STAGES, CHEBYSHEV_PEAK, StagePolynomial
+from torchcloth.dynamics.viscous_stages import CHEBYSHEV_PEAK, MAX_STAGES, StagePolynomial
 
 E = tc.effects
 
@@ -50,7 +50,7 @@ def test_the_polynomial_is_between_nothing_and_half_where_it_damps_fast(stages):
 class Inertia(E.AddedMass):
     """Of air, without what is of second order in velocities."""
 
-    def force(self, c, now):
+    def force(self, c, inputs):
         return None
 
 
@@ -83,11 +83,11 @@ def test_one_step_is_the_polynomial_of_the_viscous_force():
 ], ids=["membrane", "bending", "both"])  # fmt: skip
 def test_the_stable_step_is_stable_and_loses_energy_only(effects):
     cloth = sheet(effects)
-    found = limits(cloth)
-    assert found.stages_for(found.cheapest_step) > 0
+    result = limits(cloth)
+    assert result.stages_for(result.cheapest_step) > 0
     torch.manual_seed(0)
     state = cloth.state(cloth.rest_state().x, 0.05 * torch.randn(49, 3))
-    out = cloth(state, times=torch.linspace(0, 2000 * found.cheapest_step, 21))
+    out = cloth(state, times=torch.linspace(0, 2000 * result.cheapest_step, 21))
     energies = cloth.energy(tc.ClothState(out.x, out.v, out.x[..., :0, :]))
     total = energies["kinetic"] + energies["membrane"]
     assert (total[1:] < 1.01 * total[:-1]).all()
@@ -107,11 +107,11 @@ def test_a_sheet_in_a_hand_moves_as_it_does_with_short_steps(viscosity):
     effects = {"viscous": E.KelvinVoigt(viscosity), "gravity": E.Gravity()}
     cloth = sheet(effects, boundaries={"hand": tc.boundaries.Grasp(range(7))})
     motion, t = swung(cloth)
-    found = limits(cloth)
-    exact = cloth(cloth.rest_state(), motion, t, dt=found.stable_step(0) ** 2 / found.cheapest_step).x
-    steps = [found.cheapest_step / 2**k for k in range(3)]
-    assert found.cheapest_step > 5 * found.stable_step(0)
-    assert all(found.stages_for(dt) > 0 for dt in steps)
+    result = limits(cloth)
+    exact = cloth(cloth.rest_state(), motion, t, dt=result.stable_step(0) ** 2 / result.cheapest_step).x
+    steps = [result.cheapest_step / 2**k for k in range(3)]
+    assert result.cheapest_step > 5 * result.stable_step(0)
+    assert all(result.stages_for(dt) > 0 for dt in steps)
     errors = [float((cloth(cloth.rest_state(), motion, t, dt=dt).x - exact).square().mean().sqrt()) for dt in steps]
     assert errors[0] < 2.5e-4
     assert errors[0] > 1.5 * errors[1] > 1.5**2 * errors[2]
@@ -121,7 +121,11 @@ def test_no_stages_where_nothing_is_viscous_or_the_step_is_short():
     plain = sheet({"gravity": E.Gravity(), "damping": E.MassDamping(1.0)})
     assert limits(plain).stages_for(limits(plain).cheapest_step) == 0
     thick = limits(sheet({"viscous": E.KelvinVoigt(1.0)}))
-    assert thick.stages_for(thick.cheapest_step) > thick.stages_for(0.5 * thick.cheapest_step) > thick.stages_for(thick.stable_step(0) ** 2 / thick.cheapest_step)
+    assert (
+        thick.stages_for(thick.cheapest_step)
+        > thick.stages_for(0.5 * thick.cheapest_step)
+        > thick.stages_for(thick.stable_step(0) ** 2 / thick.cheapest_step)
+    )
     assert thick.stages_for(thick.stable_step(0) ** 2 / thick.cheapest_step) == 0
 
 
@@ -144,11 +148,11 @@ def test_a_shorter_step_is_for_cloth_that_is_pulled_farther():
 
 def test_the_step_costs_as_the_root_of_the_viscosity():
     rates = [1e4, 4e4, 16e4, 64e4]
-    found = [StabilityLimits(1e7, 0.0, rate) for rate in rates]
-    assert [f.stages_for(f.cheapest_step) for f in found] == sorted(f.stages_for(f.cheapest_step) for f in found)
-    cost = [f.stages_for(f.cheapest_step) / f.cheapest_step for f in found]
+    result = [StabilityLimits(1e7, 0.0, rate) for rate in rates]
+    assert [f.stages_for(f.cheapest_step) for f in result] == sorted(f.stages_for(f.cheapest_step) for f in result)
+    cost = [f.stages_for(f.cheapest_step) / f.cheapest_step for f in result]
     assert all(later < 2.6 * before for before, later in pairwise(cost))
-    assert found[-1].cheapest_step > 20 * found[-1].stable_step(0)
+    assert result[-1].cheapest_step > 20 * result[-1].stable_step(0)
 
 
 def test_a_step_that_overflows_is_told():

@@ -28,13 +28,13 @@ def force(cloth, x, v):
     """[V, 3] N."""
     model = cloth.build_model()
     effect, c = model.effects["it"]
-    found = effect.force(c, EffectInputs(x, v, substep.surface(model.geometry, x, v), model.mass))
+    result = effect.force(c, EffectInputs(x, v, substep.surface(model.geometry, x, v), model.mass))
     if effect.acts_on == "vertices":
-        return found
+        return result
     corners = torch.as_tensor(cloth.mesh.faces)
     out = torch.zeros_like(x)
     for k in range(3):
-        out = out.index_add(-2, corners[:, k], found / 3)
+        out = out.index_add(-2, corners[:, k], result / 3)
     return out
 
 
@@ -54,9 +54,9 @@ def moving(cloth):
     ],
 )
 def test_laws_are_those_of_known_effects(terms, known):
-    own, other = cloth_with(ResidualForce(terms)), cloth_with(known())
-    x, v = moving(own)
-    assert torch.allclose(force(own, x, v), force(other, x, v), rtol=1e-9, atol=1e-14)
+    parameter, other = cloth_with(ResidualForce(terms)), cloth_with(known())
+    x, v = moving(parameter)
+    assert torch.allclose(force(parameter, x, v), force(other, x, v), rtol=1e-9, atol=1e-14)
 
 
 def normal(x):
@@ -67,12 +67,12 @@ def normal(x):
 
 def test_across_and_along_make_up_linear_drag():
     """On a sheet that moves as a whole: the area's share of a triangle is the vertex's mass over the density."""
-    own, other = cloth_with(ResidualForce({"across": 0.4, "along": 0.1})), cloth_with(MassDamping(0.4 / DENSITY))
-    x, _ = moving(own)
+    parameter, other = cloth_with(ResidualForce({"across": 0.4, "along": 0.1})), cloth_with(MassDamping(0.4 / DENSITY))
+    x, _ = moving(parameter)
     v = torch.tensor([0.3, -0.2, 0.5]).expand_as(x)
     every, n = force(other, x, v), normal(x)
     expected = 0.25 * every + 0.75 * (every @ n)[:, None] * n
-    assert torch.allclose(force(own, x, v), expected, rtol=1e-9, atol=1e-14)
+    assert torch.allclose(force(parameter, x, v), expected, rtol=1e-9, atol=1e-14)
 
 
 def test_mass_is_added_and_weighs():
@@ -125,13 +125,13 @@ def test_what_opposes_stretching_is_still_while_bent_cloth_turns_rigidly():
 
 def test_what_opposes_bending_is_bending():
     """Without a curvature that it prefers, and the same in all directions."""
-    own, other = cloth_with(ResidualForce({"bend": 0.7})), cloth_with(Bending(0.7, poisson=0.0))
-    x, _ = moving(own)
-    u, v = torch.as_tensor(own.mesh.uv).mT
+    parameter, other = cloth_with(ResidualForce({"bend": 0.7})), cloth_with(Bending(0.7, poisson=0.0))
+    x, _ = moving(parameter)
+    u, v = torch.as_tensor(parameter.mesh.uv).mT
     bent = x + 0.005 * torch.sin(7 * u + 4 * v)[:, None] * normal(x)
-    found, expected = (force(cloth, bent, 0 * x) for cloth in (own, other))
+    result, expected = (force(cloth, bent, 0 * x) for cloth in (parameter, other))
     assert float(expected.abs().max()) > 0
-    assert torch.allclose(found, expected, rtol=0.05, atol=0.02 * float(expected.abs().max()))
+    assert torch.allclose(result, expected, rtol=0.05, atol=0.02 * float(expected.abs().max()))
 
 
 def test_what_opposes_bending_leaves_flat_cloth_alone():

@@ -107,5 +107,5 @@ def test_a_garment_lying_flat_is_no_trouble():
     cloth = tc.Cloth(mesh, tc.materials.AEP(1e5), 0.15, effects, contact=None)
     with torch.no_grad():
         out = cloth(cloth.rest_state(), times=[0.0, 0.1])
-    beside = out.v[-1] - torch.tensor([0.0, 0.0, -0.981])
-    assert float(beside.norm(dim=-1).max()) < 0.7  # 1.0 without the fading
+    tangential = out.v[-1] - torch.tensor([0.0, 0.0, -0.981])
+    assert float(tangential.norm(dim=-1).max()) < 0.7  # 1.0 without the fading

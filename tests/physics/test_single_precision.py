@@ -6,7 +6,7 @@ import pytest
 import torch
 
 import torchcloth as tc
-from torchcloth.dynamics.contact.transfer import transfer_director_forces, place_on_grid
+from torchcloth.dynamics.contact.transfer import place_on_grid, transfer_director_forces
 from torchcloth.effects import AbstractEffect
 
 SPEED = 1e-3  # m/s: some two units a substep at half a metre from the origin
@@ -20,8 +20,8 @@ class Nothing(AbstractEffect):
     def coefficients(self):
         return None
 
-    def force(self, c, now):
-        return torch.zeros_like(now.x)
+    def force(self, c, inputs):
+        return torch.zeros_like(inputs.x)
 
 
 @pytest.fixture(autouse=True)
@@ -131,8 +131,8 @@ def test_inner_friction_does_not_wear_off_as_cloth_is_turned(engine, seconds):
     """Rounding of positions is a path to it at every substep: of its share a fifth was left after a second."""
     mesh = tc.meshes.rectangle(0.1, 0.1, resolution=(11, 11))
     effects = {"own": tc.effects.BendingFriction(2e-4)}
-    held = {"hand": tc.boundaries.Grasp(range(len(mesh.vertices)))}
-    cloth = tc.Cloth(mesh, tc.materials.AEP(3e5), 0.2, effects, held, contact=None, engine=engine)
+    gripped = {"hand": tc.boundaries.Grasp(range(len(mesh.vertices)))}
+    cloth = tc.Cloth(mesh, tc.materials.AEP(3e5), 0.2, effects, gripped, contact=None, engine=engine)
     x = cloth.rest_state().x
     x[:, 2] = 0.01 * torch.sin(30 * x[:, 0])
     state = cloth.state(x + torch.tensor([0.6, 0.3, 0.2]))
@@ -154,7 +154,9 @@ def test_a_node_that_hardly_weighs_has_finite_derivatives(corner):
     grid = tc.Contact(spacing=0.01).build_grid(tc.meshes.rectangle(0.1, 0.1, resolution=(5, 5)))
     place = (0.01 * torch.full((1, 3), corner)).requires_grad_()
     mass = torch.tensor([[1e-6]], requires_grad=True)
-    nodes = place_on_grid(place, mass, torch.zeros(1, dtype=torch.int64), grid, torch.zeros(grid.nodes**3, dtype=torch.int32))
+    nodes = place_on_grid(
+        place, mass, torch.zeros(1, dtype=torch.int64), grid, torch.zeros(grid.nodes**3, dtype=torch.int32)
+    )
     change, moment = transfer_director_forces(nodes, torch.ones(1, 3), torch.ones(1, 3), grid.spacing, 1e-4)
     (change.sum() + moment.sum()).backward()
     assert torch.isfinite(place.grad).all()

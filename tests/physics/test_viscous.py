@@ -143,11 +143,11 @@ def test_viscous_forces_of_triangles_are_refused():
     class Sticky(tc.effects.KelvinVoigt):
         acts_on = "triangles"
 
-        def force(self, c, now):
-            return -c * now.surface.v
+        def force(self, c, inputs):
+            return -c * inputs.surface.v
 
-        def viscous(self, c, now):
-            return self.force(c, now)
+        def viscous(self, c, inputs):
+            return self.force(c, inputs)
 
     mesh = tc.meshes.rectangle(0.1, 0.1, triangles=32)
     cloth = tc.Cloth(mesh, tc.materials.AEP(1e4), 0.15, {"own": Sticky(50.0)}, contact=None)

@@ -127,8 +127,8 @@ def effect_contract(kind):
 
 
 class Leaks(tc.effects.MassDamping):
-    def force(self, c, now):
-        return super().force(c, now) - 1e-12 * now.mass * now.v
+    def force(self, c, inputs):
+        return super().force(c, inputs) - 1e-12 * inputs.mass * inputs.v
 
 
 class Undeclared(tc.effects.MassDamping):
@@ -136,15 +136,15 @@ class Undeclared(tc.effects.MassDamping):
 
 
 class OffByOneInTenThousand(tc.effects.MassDamping):
-    def force(self, c, now):
-        force = super().force(c, now)
+    def force(self, c, inputs):
+        force = super().force(c, inputs)
         return force - 1e-4 * (force - force.detach())  # right value, derivative off by 1e-4
 
 
 class RootOfSpeed(tc.effects.MassDamping):
-    def force(self, c, now):
-        speed = dot(now.v, now.v).sqrt()
-        return super().force(c, now) * speed / (speed + 1.0)
+    def force(self, c, inputs):
+        speed = dot(inputs.v, inputs.v).sqrt()
+        return super().force(c, inputs) * speed / (speed + 1.0)
 
 
 class SilentlyStiff(tc.effects.Bending):
@@ -153,8 +153,8 @@ class SilentlyStiff(tc.effects.Bending):
 
 
 class TwiceAsViscous(tc.effects.KelvinVoigt):
-    def viscous(self, c, now):
-        return 2 * super().viscous(c, now)
+    def viscous(self, c, inputs):
+        return 2 * super().viscous(c, inputs)
 
 
 class ViscousWithoutRate(tc.effects.KelvinVoigt):
@@ -168,8 +168,8 @@ class StiffAtZero(tc.effects.MassDamping):
 
 
 class MixesTheBatch(tc.effects.MassDamping):
-    def force(self, c, now):
-        return super().force(c, now) * (1 + now.v.mean())
+    def force(self, c, inputs):
+        return super().force(c, inputs) * (1 + inputs.v.mean())
 
 
 @pytest.mark.parametrize(

@@ -114,9 +114,7 @@ def bytes_of(*tensors: Tensor) -> int:
 
 
 def _is_plain(tensor: Tensor) -> bool:
-    unsupported = (
-        tensor.device.type != "cpu" or tensor.layout != torch.strided or tensor.dtype not in CACHEABLE_DTYPES
-    )
+    unsupported = tensor.device.type != "cpu" or tensor.layout != torch.strided or tensor.dtype not in CACHEABLE_DTYPES
     if type(tensor) is not Tensor or unsupported or tensor.is_inference():
         return False
     return not (tensor.requires_grad and torch.is_grad_enabled())

@@ -15,7 +15,7 @@ from .model import Model
 from .viscous_stages import MAX_STAGES, StagePolynomial
 
 # Substep over the linear stability limit. It leaves room for tangents that double beyond what the material states.
-STEP_SAFETY_FACTOR = 0.7
+STABLE_STEP_OVER_LINEAR_LIMIT = 0.7
 # Largest speed with which a grip yields to a viscous force, over the speed that causes the force. Beyond it viscous
 # forces act in one piece: stages treat gripped vertices as prescribed.
 MAX_GRIP_SPEED_RATIO = 4.0
@@ -36,15 +36,17 @@ class StabilityLimits(NamedTuple):
     viscous_rate: float
 
     def stable_step(self, stages: int) -> float:
-        """Return the stable substep [s] with so many stages: STEP_SAFETY_FACTOR x 2 / omega, less with damping."""
+        """Return the stable substep [s] with so many stages: at most STABLE_STEP_OVER_LINEAR_LIMIT x 2 / omega."""
         if stages == 0:
             return self._explicit_step(4, self.damping_rate + self.viscous_rate)
-        limit = STEP_SAFETY_FACTOR * StagePolynomial.for_stages(stages).largest_rate / self.viscous_rate
+        limit = STABLE_STEP_OVER_LINEAR_LIMIT * StagePolynomial.for_stages(stages).largest_rate / self.viscous_rate
         return min(self._explicit_step(2, self.damping_rate), limit)
 
     def _explicit_step(self, room: float, c: float) -> float:
-        """Return STEP_SAFETY_FACTOR times the dt for which room - 2 c dt - omega^2 dt^2 = 0."""
-        return STEP_SAFETY_FACTOR * ((c**2 + room * self.squared_frequency) ** 0.5 - c) / self.squared_frequency
+        """Return STABLE_STEP_OVER_LINEAR_LIMIT times the dt for which room - 2 c dt - omega^2 dt^2 = 0."""
+        return (
+            STABLE_STEP_OVER_LINEAR_LIMIT * ((c**2 + room * self.squared_frequency) ** 0.5 - c) / self.squared_frequency
+        )
 
     @property
     def cheapest_step(self) -> float:

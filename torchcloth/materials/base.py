@@ -15,7 +15,7 @@ class Stiffness(NamedTuple):
 
     In the plane, in the material's axes, a strain e must not raise the energy by more than half of warp e11^2 + weft
     e22^2 + 2 coupling e11 e22 + in_plane_shear (2 e12)^2. For a law that stiffens with strain take the stiffest state.
-    ``stability.STEP_SAFETY_FACTOR`` covers a factor of two beyond these values.
+    ``stability.STABLE_STEP_OVER_LINEAR_LIMIT`` covers a factor of two beyond these values.
 
     Attributes:
         warp: lambda + 2 mu of an isotropic law.

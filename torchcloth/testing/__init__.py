@@ -1,10 +1,10 @@
-"""Contracts for your own parts: inherit one, say how to make the part, and pytest runs what the layer relies on.
+"""Contracts for your own parts: inherit one, define how to make the part, and pytest checks what the layer relies on.
 
     class TestMyFabric(torchcloth.testing.MaterialContract):
         def make(self):
             return MyFabric(stiffness=300.0)
 
-Needs no pytest: ``MyContract().check()`` runs the same promises anywhere.
+pytest is optional: ``MyContract().check()`` checks the same promises anywhere.
 """
 
 from .boundary import BoundaryContract, GraspContract

@@ -26,7 +26,7 @@ from .finite_differences import check_gradients
 
 
 class BoundaryContract(Contract):
-    """What the layer relies on in a boundary. Override ``make``; ``sample`` if it does not act near z = 0.
+    """What the layer relies on in a boundary. Override ``make``, and ``sample`` if it does not act near z = 0.
 
     Attributes:
         dt: substep of the trials [s].
@@ -38,20 +38,20 @@ class BoundaryContract(Contract):
 
     @abstractmethod
     def make(self) -> AbstractBoundary:
-        """The boundary, not yet bound to a mesh."""
+        """Make the boundary, not yet bound to a mesh."""
 
     def mesh(self) -> Mesh:
-        """The sheet on which the boundary is tried."""
+        """Build the sheet on which the boundary is tested."""
         return rectangle(0.3, 0.2, resolution=(4, 4))
 
     def sample(self) -> tuple[Tensor, Tensor]:
-        """Positions and velocities [V, 3] of which some feel the boundary and some do not, none exactly between."""
+        """Draw positions and velocities [V, 3], of which some feel the boundary and some do not, none at the limit."""
         rest = torch.as_tensor(self.mesh().vertices)
         lift = torch.tensor([0.0, 0.0, 0.001], dtype=rest.dtype)  # a step of dt at 1 m/s: some arrive, some do not
         return rest + lift * samples.normal((len(rest), 1), 1), samples.normal(tuple(rest.shape), 2)
 
     def rest(self) -> tuple[Tensor, Tensor]:
-        """A state exactly on the boundary and still, where square roots and switches lose their derivatives."""
+        """Return a state exactly on the boundary and at rest, where square roots and switches lose derivatives."""
         x = torch.as_tensor(self.mesh().vertices)
         return x, torch.zeros_like(x)
 
@@ -70,8 +70,8 @@ class BoundaryContract(Contract):
         pose[:, :3, 3] = 0.1 * angle[:, 0] ** 2 * pose.new_tensor([1.0, -0.5, 0.7])
         return pose
 
-    def _drive(self, pose: Tensor, closed: bool = True) -> PrescribedMotion:
-        """The substeps of a body that goes through the poses at equal times."""
+    def _prescribe(self, pose: Tensor, closed: bool = True) -> PrescribedMotion:
+        """Sample the motion of a body that passes the poses at equal times."""
         t = torch.linspace(0.0, self.substeps * self.dt, pose.shape[-3], dtype=pose.dtype)
         substeps = torch.linspace(0.0, float(t[-1]), self.substeps + 1, dtype=pose.dtype)
         return sample_trajectory(Trajectory(t, pose, torch.full((len(t),), closed)), substeps)
@@ -81,7 +81,7 @@ class BoundaryContract(Contract):
         return None
 
     def _apply(self, boundary: AbstractBoundary, x: Tensor, v: Tensor, pose: Tensor | None = None) -> Tensor:
-        return boundary.constrain(x, v, self.dt, None if pose is None else self._drive(pose), 1)
+        return boundary.constrain(x, v, self.dt, None if pose is None else self._prescribe(pose), 1)
 
     def _inputs(self) -> dict[str, Tensor]:
         x, v = self.sample()
@@ -89,32 +89,32 @@ class BoundaryContract(Contract):
         return {"x": x, "v": v} if pose is None else {"x": x, "v": v, "pose": pose}
 
     def test_acts(self) -> None:
-        """On the sampled state it changes some velocities; else the other tests show nothing."""
+        """The boundary changes some velocities of the sample; else the other tests prove nothing."""
         inputs = self._inputs()
         changed = (self._apply(self._boundary(), **inputs).detach() != inputs["v"]).any(-1)
         require(changed.any(), "the boundary changes nothing on sample(); override sample()")
 
     def test_applying_twice_changes_nothing(self) -> None:
-        """What obeys a boundary passes it unchanged."""
+        """Velocities that obey the boundary pass it unchanged."""
         boundary, inputs = self._boundary(), self._inputs()
         once = self._apply(boundary, **inputs).detach()
         twice = self._apply(boundary, **{**inputs, "v": once}).detach()
         require_close(twice, once, 1e-11, "applying the boundary twice differs from once")
 
     def test_gradients(self) -> None:
-        """Sweeps in positions, velocities, poses and every parameter."""
+        """Gradients in positions, velocities, poses and every parameter agree with finite differences."""
         boundary = self._boundary()
         names = detached_parameters(boundary)
 
         def evaluate(**values: Tensor) -> Tensor:
-            own = {name: values.pop(name) for name in names}
-            return call_with(boundary, own, self._apply, values["x"], values["v"], values.get("pose"))
+            parameters = {name: values.pop(name) for name in names}
+            return call_with(boundary, parameters, self._apply, values["x"], values["v"], values.get("pose"))
 
         # steps small enough that no vertex changes between touching and free
         check_gradients(evaluate, {**self._inputs(), **names}, 1e-7, steps=[10.0 ** (-2 - k / 2) for k in range(11)])
 
     def test_gradients_are_finite_at_rest(self) -> None:
-        """Exactly on the boundary, still."""
+        """Gradients are finite exactly on the boundary, at rest."""
         boundary = self._boundary()
         x, v = self.rest()
         pose = self._pose()
@@ -125,7 +125,7 @@ class BoundaryContract(Contract):
         require_finite_gradients(result, {**leaves, **dict(boundary.named_parameters())}, "at rest on the boundary")
 
     def test_batches_equal_loops(self) -> None:
-        """Batched states, poses and parameters give what a loop gives."""
+        """Batches of states, poses and parameters give what a loop gives."""
         boundary = self._boundary()
         parameters = detached_parameters(boundary)
         many = batch_parameters(parameters, 3)
@@ -142,7 +142,7 @@ class BoundaryContract(Contract):
             require_close(together[k], alone, 1e-12, f"batch entry {k} differs from the loop")
 
     def test_works_in_float32(self) -> None:
-        """Same velocities to single precision, and no silent promotion."""
+        """Velocities agree to single precision, without silent promotion."""
         inputs = self._inputs()
         exact = self._apply(self._boundary(), **inputs).detach()
         got = self._apply(self._boundary().float(), **{k: value.float() for k, value in inputs.items()}).detach()
@@ -156,41 +156,43 @@ class GraspContract(BoundaryContract):
 
     @abstractmethod
     def gripped_vertices(self) -> list[int]:
-        """The vertices that are carried."""
+        """Return the vertices that the grasp carries."""
 
     def _pose(self) -> Tensor:
         return self._travel()
 
     def test_is_driven(self) -> None:
-        """Without a trajectory the layer must refuse to run."""
+        """The layer refuses to run without a trajectory."""
         require(type(self._boundary()).is_prescribed, "a grasp must declare is_prescribed = True")
 
     def test_held_vertices_follow_the_pose_exactly(self) -> None:
-        """No drift over many substeps, whatever the rest of the cloth does."""
+        """Gripped vertices do not drift over many substeps, whatever the rest of the cloth does."""
         boundary = self._boundary()
-        pose, held = self._pose(), self.gripped_vertices()
-        motion = self._drive(pose)
+        pose, gripped = self._pose(), self.gripped_vertices()
+        motion = self._prescribe(pose)
         x, v = self.sample()
-        start, wild = x[held], v
+        start, wild = x[gripped], v
         for k in range(self.substeps):
             v = boundary.constrain(x, v + 0.1 * wild, self.dt, motion, k)
             x = x + self.dt * v
         turn = pose[-1, :3, :3] @ pose[0, :3, :3].mT
         expected = (start - pose[0, :3, 3]) @ turn.mT + pose[-1, :3, 3]
-        require_close(x[held], expected, 1e-12, "held vertices do not follow the pose")
+        require_close(x[gripped], expected, 1e-12, "held vertices do not follow the pose")
 
     def test_says_what_it_holds(self) -> None:
-        """While it is closed, and nothing while it is open."""
+        """It names the gripped vertices while it is closed, and none while it is open."""
         boundary, pose = self._boundary(), self._pose()
-        index = boundary.prescribed_vertices(self._drive(pose), 0)
+        index = boundary.prescribed_vertices(self._prescribe(pose), 0)
         require(
             index is not None and sorted(index.tolist()) == sorted(self.gripped_vertices()),
             "prescribed_vertices() names other vertices",
         )
-        require(boundary.prescribed_vertices(self._drive(pose, False), 0) is None, "an open gripper says that it holds")
+        require(
+            boundary.prescribed_vertices(self._prescribe(pose, False), 0) is None, "an open gripper says that it holds"
+        )
 
     def test_an_open_gripper_lets_go(self) -> None:
-        """Velocities pass untouched."""
+        """An open gripper leaves velocities unchanged."""
         x, v = self.sample()
-        after = self._boundary().constrain(x, v, self.dt, self._drive(self._pose(), False), 0)
+        after = self._boundary().constrain(x, v, self.dt, self._prescribe(self._pose(), False), 0)
         require(torch.equal(after, v), "an open gripper changes the cloth")

@@ -21,9 +21,9 @@ class ColliderContract(BoundaryContract):
     Attributes:
         moving: the collider travels and turns during the trials.
         extent: the body lies within this distance of its origin [m].
-        rounding: error of distances [m]; and
-        slant: of normals against the gradient of the distance, both 0 but for rounding where they have closed forms.
-        projections: steps along the normal that bring a point to the surface.
+        rounding: error of distances [m], rounding alone where they have closed forms.
+        slant: error of normals against the gradient of the distance, rounding alone for closed forms.
+        projections: number of steps along the normal that bring a point to the surface.
     """
 
     moving = False
@@ -34,10 +34,10 @@ class ColliderContract(BoundaryContract):
 
     @abstractmethod
     def collider(self, **options: Any) -> AbstractCollider:
-        """The collider with Coulomb friction > 0, given these options (``moving``, ``recovery``)."""
+        """Make the collider with Coulomb friction > 0 and these options (``moving``, ``recovery``)."""
 
     def make(self) -> AbstractCollider:
-        """The collider of the general promises."""
+        """Make the collider that the general promises test."""
         return self.collider(moving=self.moving)
 
     def _pose(self) -> Tensor | None:
@@ -57,11 +57,11 @@ class ColliderContract(BoundaryContract):
         return p, samples.normal(tuple(p.shape), 2)
 
     def sample(self) -> tuple[Tensor, Tensor]:
-        """All around the surface: inside, arriving, leaving."""
+        """Draw states all around the surface: inside, arriving, leaving."""
         return self._at(0.001 * samples.normal((len(self.mesh().vertices), 1), 3))
 
     def rest(self) -> tuple[Tensor, Tensor]:
-        """Exactly on the surface, still."""
+        """Return a state exactly on the surface, at rest."""
         x, _ = self._at(torch.zeros(len(self.mesh().vertices), 1, dtype=torch.float64))
         return x, torch.zeros_like(x)
 
@@ -71,7 +71,7 @@ class ColliderContract(BoundaryContract):
         return torch.cartesian_prod(steps, steps, steps)
 
     def test_the_normal_is_the_gradient_of_the_distance(self) -> None:
-        """And has unit length; near the surface, inside and outside."""
+        """The normal is the distance's gradient, of unit length, near the surface inside and outside."""
         body = self._body()
         p = self._at(0.02 * self.extent * samples.normal((200, 1), 4))[0].requires_grad_()
         distance, normal = body.clearance(p)
@@ -80,7 +80,7 @@ class ColliderContract(BoundaryContract):
         require_close(slope, normal, self.slant, "the normal is not the gradient of the distance")
 
     def test_the_distance_leads_to_the_surface(self) -> None:
-        """Going back along the normal by the distance ends at distance 0: it is in metres."""
+        """Moving back along the normal by the distance ends at distance 0: it is in metres."""
         body = self._body()
         p, _ = self._at(0.02 * self.extent * samples.normal((200, 1), 4))
         distance, normal = body.clearance(p)
@@ -88,7 +88,7 @@ class ColliderContract(BoundaryContract):
         require(left <= self.rounding, f"the surface is missed by {left:.2e} m")
 
     def test_is_finite_everywhere(self) -> None:
-        """Distances, normals and derivatives at centres, axes, edges and far away."""
+        """Distances, normals and derivatives are finite at centres, axes, edges and far away."""
         body = self._body()
         p = self._lattice().requires_grad_()
         distance, normal = body.clearance(p)
@@ -98,7 +98,7 @@ class ColliderContract(BoundaryContract):
         require_finite_gradients(torch.cat([distance, normal], dim=-1), leaves, "on a lattice through the body")
 
     def test_nothing_enters(self) -> None:
-        """What starts outside ends outside, but for the curvature within one substep."""
+        """Points that start outside end outside, but for the curvature within one substep."""
         body = self._body()
         x, v = self._at(0.001 * samples.normal((200, 1), 5).abs())
         after = body.constrain(x, v, self.dt, None, 0)
@@ -107,7 +107,7 @@ class ColliderContract(BoundaryContract):
         require(deepest >= -curved - self.rounding, f"{-deepest:.2e} m deep after a substep")
 
     def test_what_starts_inside_is_moved_out_gently(self) -> None:
-        """At the given speed, not at depth over dt; and it does not go deeper."""
+        """Points inside leave at the given speed, not at depth over dt, and do not go deeper."""
         body = self._body(recovery=0.05)
         x, v = self._at(torch.full((200, 1), -0.1 * self.extent, dtype=torch.float64))
         distance, normal = (part.detach() for part in body.clearance(x))
@@ -119,7 +119,7 @@ class ColliderContract(BoundaryContract):
         require((moved >= 0.05 * (1 - 1e-9)).all(), "what is inside goes deeper")
 
     def test_friction_stays_in_the_cone(self) -> None:
-        """It opposes the slip, takes at most mu times the push, and exactly that from what still slips."""
+        """Friction opposes the slip, is at most mu times the push, and exactly that where points still slip."""
         body = self._body()
         x, v = self._at(torch.zeros(200, 1, dtype=torch.float64))
         after, normal = body.constrain(x, v, self.dt, None, 0).detach(), body.clearance(x)[1].detach()
@@ -136,9 +136,9 @@ class ColliderContract(BoundaryContract):
         require_close(taken[slides], mu * push[slides], 1e-9, "sliding friction is not mu times the push")
 
     def test_forward_mode_agrees_with_reverse_mode(self) -> None:
-        """In positions and velocities."""
+        """Forward and reverse mode agree in positions and velocities."""
         body, (x, v) = self._body(moving=self.moving), self.sample()
-        motion, k = (self._drive(self._travel()) if self.moving else None), 1
+        motion, k = (self._prescribe(self._travel()) if self.moving else None), 1
         weight, along = samples.normal(tuple(x.shape), 6), samples.normal((2, *x.shape), 7)
 
         def answer(x: Tensor, v: Tensor) -> Tensor:
@@ -151,9 +151,9 @@ class ColliderContract(BoundaryContract):
         require_close(forward, torch.as_tensor(reverse), 1e-10, "forward and reverse mode differ")
 
     def test_moves_as_a_rigid_body(self) -> None:
-        """Seen from the travelling body, cloth meets what it meets at a body that stands still."""
+        """A travelling body responds as a fixed one does, as seen from the body."""
         x, v = self.sample()
-        motion, k = self._drive(self._travel()), 77
+        motion, k = self._prescribe(self._travel()), 77
         step, end = motion.increment[k], motion.pose[k]
         turn, origin = end[:3, :3], end[:3, 3]
         start = torch.linalg.inv(step) @ end

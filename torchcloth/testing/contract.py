@@ -1,4 +1,4 @@
-"""What all contracts share."""
+"""Base class of contracts, and helpers that they share."""
 
 from __future__ import annotations
 
@@ -19,7 +19,11 @@ class Contract(ABC):  # noqa: B024 - what is abstract differs between the contra
     """
 
     def check(self) -> None:
-        """Run every promise; the first broken one raises AssertionError."""
+        """Run every promise.
+
+        Raises:
+            AssertionError: the first promise that is broken.
+        """
         for name in dir(self):
             if name.startswith("test_"):
                 getattr(self, name)()
@@ -27,7 +31,7 @@ class Contract(ABC):  # noqa: B024 - what is abstract differs between the contra
 
 @contextmanager
 def float64() -> Iterator[None]:
-    """Parts made in here are float64 from the start, not float32 numbers written out in float64."""
+    """Set the default precision to float64 within the block, so that parts are float64 from the start."""
     before = torch.get_default_dtype()
     torch.set_default_dtype(torch.float64)
     try:
@@ -46,24 +50,24 @@ class _Caller(nn.Module):
 
 
 def call_with(part: nn.Module, parameters: dict[str, Tensor], function: Callable[..., Any], *args: Any) -> Any:
-    """``function(part, *args)`` with the part's parameters replaced, so that gradients and batches reach them."""
+    """Return ``function(part, *args)`` with the part's parameters replaced, to give them gradients or batches."""
     named = {f"part.{name}": value for name, value in parameters.items()}
     return functional_call(_Caller(part, function), named, args)
 
 
 def detached_parameters(part: nn.Module) -> dict[str, Tensor]:
-    """The part's own parameters by name, detached."""
+    """Return the part's parameters by name, detached."""
     return {name: value.detach() for name, value in part.named_parameters()}
 
 
 def batch_parameters(parameters: dict[str, Tensor], size: int, spread: float = 0.1) -> dict[str, Tensor]:
-    """``size`` different copies of each parameter in the layout of a batch: [] -> [B, 1], [...] -> [B, ...]."""
+    """Make ``size`` different copies of each parameter in the layout of a batch: [] -> [B, 1], [...] -> [B, ...]."""
     factor = 1 + spread * torch.linspace(-1, 1, size, dtype=torch.float64)
     return {name: factor.reshape(-1, *[1] * max(1, p.ndim)) * p for name, p in parameters.items()}
 
 
 def unbatch_parameters(parameters: dict[str, Tensor], like: dict[str, Tensor], k: int) -> dict[str, Tensor]:
-    """Copy ``k`` of a batch of parameters, in the shape of the unbatched ones."""
+    """Return copy ``k`` of a batch of parameters, in the shape of the unbatched ones."""
     return {name: value[k].reshape(like[name].shape) for name, value in parameters.items()}
 
 

@@ -1,4 +1,4 @@
-"""The contract of an effect."""
+"""The contract of effects, for your own ones."""
 
 from __future__ import annotations
 
@@ -37,16 +37,18 @@ class EffectContract(Contract):
 
     @abstractmethod
     def make(self, amplitude: float) -> AbstractEffect:
-        """The effect, not yet bound to a mesh, with this amplitude in its own unit and all others 0."""
+        """Make the effect, not yet bound to a mesh, with this amplitude in its unit and all others 0."""
 
     def base(self) -> dict[str, AbstractEffect]:
-        """The model that amplitude 0 must leave unchanged: the bare membrane, or, for a parameter that only changes
-        what others do (wind on drag, tilt on weight), the effect without it.
+        """Return the effects of the model that amplitude 0 must leave unchanged.
+
+        None of them for the bare membrane. For a parameter that only modifies another one (wind on drag, tilt on
+        weight) the effect without it.
         """
         return {}
 
     def mesh(self) -> Mesh:
-        """The sheet on which the effect is tried."""
+        """Build the sheet on which the effect is tested."""
         return rectangle(0.3, 0.2, resolution=(4, 4))
 
     def _effect(self, amplitude: float | None = None) -> AbstractEffect:
@@ -66,15 +68,15 @@ class EffectContract(Contract):
             return Cloth(self.mesh(), AEP(1e5, 0.3), 0.2, effects, contact=None, engine="reference").double()
 
     def _state(self) -> dict[str, Tensor]:
-        """Bent, stretched and moving."""
+        """Return a state that is bent, stretched and moving."""
         rest = torch.as_tensor(self.mesh().vertices) @ samples.rotation(2).mT
         x = rest + 0.01 * samples.normal(tuple(rest.shape), 3)
         return {"x": x, "v": samples.normal(tuple(rest.shape), 4)}
 
     def _answers(self) -> Callable[..., dict[str, Tensor]]:
-        """answers(effect, x, v): by hook, what the effect says there; hooks that it does not use are left out.
+        """Return a function (effect, x, v) -> results by hook, without the hooks that the effect does not use.
 
-        An effect that remembers has come from the flat sheet, through half the way, to ``x``.
+        The memory of an effect has evolved from the flat sheet, through half the way, to ``x``.
         """
         model = self._cloth({}).build_model()
         rest = torch.as_tensor(self.mesh().vertices)
@@ -90,18 +92,18 @@ class EffectContract(Contract):
                 now = now._replace(memory=effect.update_memory(c, between))
                 now = now._replace(memory=effect.update_memory(c, now))
             index = torch.arange(3)
-            held = v.index_fill(-2, index, 0.0)
-            loose = effect.grip_velocities(c, index, v, held, mass, 1e-3, None)
-            found = {
+            gripped = v.index_fill(-2, index, 0.0)
+            slipped = effect.grip_velocities(c, index, v, gripped, mass, 1e-3, None)
+            results = {
                 "force": effect.force(c, now),
                 "viscous": effect.viscous(c, now),
                 "mass": effect.mass(c),
                 "inertia": effect.inertia(c, now.surface),
-                "growth": effect.rest_deformation(c),
+                "rest_deformation": effect.rest_deformation(c),
                 "memory": now.memory,
-                "grip": None if effect.grasp is None else loose,
+                "grip": None if effect.grasp is None else slipped,
             }
-            return {name: value for name, value in found.items() if value is not None}
+            return {name: value for name, value in results.items() if value is not None}
 
         return answers
 
@@ -119,7 +121,7 @@ class EffectContract(Contract):
         return out
 
     def test_declares_itself(self) -> None:
-        """Unit, typical and smallest amplitude, equivalences, and one row of force per vertex or triangle."""
+        """It declares unit, typical and smallest amplitude and equivalences, and has one row of force per element."""
         effect = self._effect()
         kind = type(effect)
         for name, size in kind.amplitudes.items():
@@ -136,19 +138,19 @@ class EffectContract(Contract):
         require(shape == (rows, 3), f"force has shape {shape}; acts_on = {kind.acts_on!r} promises ({rows}, 3)")
 
     def test_amplitude_zero_is_bitwise_the_base_model(self) -> None:
-        """Also the stable step must be the same, or the comparison of models would compare steps."""
+        """Amplitude 0 changes nothing, not even the stable step: models are compared at equal steps."""
         runs = [self._run(effects) for effects in (self.base(), {"effect": self.make(0.0)})]
         require(torch.equal(runs[0].x, runs[1].x), "amplitude 0 changes the positions of the base model")
         require(torch.equal(runs[0].v, runs[1].v), "amplitude 0 changes the velocities of the base model")
 
     def test_amplitude_reaches_the_motion(self) -> None:
-        """The typical amplitude does something."""
+        """The typical amplitude changes the motion."""
         runs = [self._run({"effect": self.make(size)}) for size in (0.0, self._size(self.make(0.0)).typical)]
         require(torch.isfinite(runs[1].x).all(), "the typical amplitude gives no finite motion")
         require(not torch.equal(runs[0].x, runs[1].x), "the typical amplitude changes nothing")
 
     def _run(self, effects: dict[str, AbstractEffect]) -> ClothState:
-        """A few substeps of the sample, with a gripper that moves on if the effect belongs to one."""
+        """Simulate a few substeps of the sample, with a moving gripper if the effect belongs to one."""
         grasp = next((effect.grasp for effect in effects.values()), self.make(0.0).grasp)
         with float64():
             boundaries = {} if grasp is None else {grasp: Grasp([0, 1])}
@@ -163,7 +165,7 @@ class EffectContract(Contract):
             return cloth(cloth.state(**self._state()), motion, t).state
 
     def test_gradients(self) -> None:
-        """Sweeps in positions, velocities and every parameter."""
+        """Gradients in positions, velocities and every parameter agree with finite differences."""
         effect = self._effect()
         parameters = detached_parameters(effect)
         answers = self._answers()
@@ -176,7 +178,7 @@ class EffectContract(Contract):
             check_gradients(evaluate, {**self._state(), **parameters}, 1e-7)
 
     def test_gradients_are_finite_at_rest(self) -> None:
-        """Flat and still, with typical amplitude and with 0: where every fit starts."""
+        """Gradients are finite on the flat sheet at rest, with typical amplitude and with 0, where fits start."""
         for amplitude in (None, 0.0):
             effect = self._effect(amplitude)
             x = torch.as_tensor(self.mesh().vertices).clone().requires_grad_()
@@ -189,7 +191,7 @@ class EffectContract(Contract):
                     require_finite_gradients(answer, leaves, where)
 
     def test_rates_bound_the_spectrum_at_rest(self) -> None:
-        """A stiff or strongly damping effect must say so, or the step that the layer chooses is not stable."""
+        """``stability_bounds`` covers the spectrum; else the step that the layer chooses is not stable."""
         effect = self._effect()
         mass = self._cloth({}).build_model().mass.detach()
         bounds = effect.stability_bounds(effect.coefficients(), mass)
@@ -200,7 +202,7 @@ class EffectContract(Contract):
             require(largest <= allowed, f"stability_bounds() bounds the {name} by {allowed:.4g}, it is {largest:.4g}")
 
     def test_viscous_is_the_part_of_the_force_that_it_says(self) -> None:
-        """It may act in stages: linear in velocity, symmetric, never driving, within its rate; so is what is left."""
+        """``viscous`` is linear in velocity, symmetric, never driving and within its bound, as is the rest."""
         effect, state = self._effect(), self._state()
         x, v = state["x"], state["v"]
         once, twice = (self._viscous(effect, x, factor * v).detach() for factor in (1.0, 2.0))
@@ -216,10 +218,13 @@ class EffectContract(Contract):
         require(slowest >= -1e-9 * max(1.0, fastest), "viscous() drives some motion")
         require(fastest <= rate * (1 + 1e-9) + 1e-9, f"viscous_stability_bound() says {rate:.4g}, it is {fastest:.4g}")
         largest = float(torch.linalg.eigvals(self._rates(effect, self._damping) - matrix).real.max())
-        require(largest <= whole * (1 + 1e-9) - rate + 1e-9, "stability_bounds() must bound what is not viscous by the difference")
+        require(
+            largest <= whole * (1 + 1e-9) - rate + 1e-9,
+            "stability_bounds() must bound what is not viscous by the difference",
+        )
 
     def _rates(self, effect: AbstractEffect, jacobian: Callable[..., Tensor]) -> Tensor:
-        """Minus a force's derivative at rest, over the roots of the masses on both sides."""
+        """Return minus a force's derivative at rest, over the roots of the masses on both sides."""
         x = torch.as_tensor(self.mesh().vertices)
         root = self._cloth({}).build_model().mass.detach().sqrt().expand_as(x).reshape(-1)
         return -jacobian(effect, x, torch.zeros_like(x)).reshape(len(root), -1) / root[:, None] / root
@@ -234,7 +239,7 @@ class EffectContract(Contract):
         return torch.autograd.functional.jacobian(lambda moved: self._viscous(effect, x, moved), v)  # type: ignore[return-value]
 
     def test_batches_equal_loops(self) -> None:
-        """Batched states and parameters give what a loop gives."""
+        """Batches of states and parameters give what a loop gives."""
         effect, answers = self._effect(), self._answers()
         parameters = detached_parameters(effect)
         many, state = batch_parameters(parameters, 3), self._state()
@@ -249,7 +254,7 @@ class EffectContract(Contract):
                 require_close(batch[k], answer.detach(), 1e-12, f"{name} of batch entry {k} differs from the loop")
 
     def test_works_in_float32(self) -> None:
-        """Same answers to single precision, and no silent promotion."""
+        """Results agree to single precision, without silent promotion."""
         state = self._state()
         exact = self._answers()(self._effect(), **state)
         single_state = {name: value.float() for name, value in state.items()}

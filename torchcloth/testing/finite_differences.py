@@ -12,19 +12,19 @@ from torch import Tensor
 from ..errors import InvalidInput
 
 DIFFERENCE_STEPS = tuple(10.0 ** (-1 - k / 2) for k in range(10))
-_ROUNDING_STEPS = (1e-9, 3e-10)  # steps at which a second difference shows nothing but rounding
+_ROUNDING_STEPS = (1e-9, 3e-10)  # at these steps a second difference is rounding alone
 _DERIVATIVE_ROUNDING = 1e-12  # relative, of a derivative that was itself computed in float64
 
 
 @dataclass(frozen=True)
 class Sweep:
-    """Central differences of a function over falling steps, beside the derivative that is claimed.
+    """Central differences of a function over falling steps, and the derivative that is claimed.
 
     Attributes:
         steps: [N] falling, in units of the direction.
         estimates: [N] central differences.
-        derivative: the claim.
-        noise: rounding of one difference of function values, measured.
+        derivative: the claimed derivative.
+        noise: measured rounding of one difference of function values.
     """
 
     steps: Tensor
@@ -34,29 +34,29 @@ class Sweep:
 
     @property
     def scale(self) -> float:
-        """What errors are relative to: the derivative, or the estimates where the claim is smaller."""
+        """Scale of relative errors: the derivative, or the median estimate where that is larger."""
         return max(abs(self.derivative), float(self.estimates.abs().median())) or 1.0
 
     @property
     def errors(self) -> Tensor:
-        """[N] relative."""
+        """Relative errors of the estimates, [N]."""
         return (self.estimates - self.derivative).abs() / self.scale
 
     @property
     def floor(self) -> Tensor:
-        """[N] relative error that rounding explains."""
+        """Relative errors that rounding explains, [N]."""
         return self.noise / (self.steps * self.scale) + _DERIVATIVE_ROUNDING
 
     def check(self, tolerance: float = 1e-7, slack: float = 0.2) -> float:
-        """Accept the derivative, or say why not.
+        """Accept the derivative, or raise an error that says why not.
 
         The error must fall with slope 2 +- ``slack`` wherever it is neither rounding (ten times the floor) nor settled
-        (a hundredth of the tolerance), and reach ``tolerance`` where rounding would not hide more than that. Coarse
-        steps before a slope that is off do not count (higher orders, a kink within reach), so a wrong derivative leaves
-        nothing that counts. Errors that are rounding from the start are accepted: parabolas have no others.
+        (a hundredth of the tolerance). It must reach ``tolerance`` where rounding would not hide more than that. Coarse
+        steps before a wrong slope do not count (higher orders, a kink within reach), so a wrong derivative leaves no
+        step that counts. Errors that are rounding from the start are accepted: parabolas have no others.
 
         Returns:
-            the smallest relative error.
+            The smallest relative error.
 
         Raises:
             AssertionError: with the table of steps, errors and slopes.
@@ -96,7 +96,7 @@ def finite_difference_sweep(
     derivative: float | Tensor,
     steps: Sequence[float] = DIFFERENCE_STEPS,
 ) -> Sweep:
-    """Central differences of ``function`` at ``point`` along ``direction``, to compare with ``derivative``.
+    """Compute central differences of ``function`` at ``point`` along ``direction``, to compare with ``derivative``.
 
     Args:
         function: point -> scalar, in float64.
@@ -137,7 +137,7 @@ def check_gradients(
     sizes: Mapping[str, float] | None = None,
     acts: bool = False,
 ) -> dict[str, float]:
-    """Sweep a function's reverse-mode gradient in each of its inputs, along random directions of the input's size.
+    """Check a function's reverse-mode gradient in each input by a sweep along a random direction of the input's size.
 
     Args:
         function: called with ``inputs`` by keyword; a result that is not scalar is weighted at random and summed.
@@ -146,10 +146,10 @@ def check_gradients(
         steps: of the sweep.
         seed: of directions and weights.
         sizes: of a coarse change of an input, where its own mean size is not it (logarithms).
-        acts: an input that does not move the result is an error, too: a sweep of nothing proves nothing.
+        acts: raise an error also for an input that does not change the result, which a sweep cannot test.
 
     Returns:
-        the smallest relative error of each input.
+        The smallest relative error of each input.
 
     Raises:
         AssertionError: naming the input whose gradient is wrong.

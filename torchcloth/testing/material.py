@@ -1,4 +1,4 @@
-"""The contract of a material."""
+"""The contract of materials, for your own ones."""
 
 from __future__ import annotations
 
@@ -26,41 +26,41 @@ from .finite_differences import check_gradients, finite_difference_sweep
 
 
 def membrane_stress(material: AbstractMaterial, f1: Tensor, f2: Tensor) -> Tensor:
-    """Both columns [..., E, 2, 3]."""
+    """Compute both columns of the membrane stress, [..., E, 2, 3] N/m."""
     return torch.stack(material.membrane_stress(material.coefficients(), samples.surface(f1, f2)), dim=-2)
 
 
 def membrane_energy(material: AbstractMaterial, f1: Tensor, f2: Tensor) -> Tensor:
-    """[..., E, 1]."""
+    """Compute the energy density of the membrane, [..., E, 1] J/m^2."""
     return material.membrane_energy(material.coefficients(), samples.surface(f1, f2))
 
 
 def director_stress(material: AbstractMaterial, n: Tensor, d3: Tensor) -> Tensor:
-    """Derivatives with respect to n and d3 [..., E, S, 2, 3]."""
+    """Compute the derivatives of the director's energy by n and d3, [..., E, S, 2, 3] N/m."""
     return torch.stack(torch.broadcast_tensors(*material.director_stress(_per_point(material), n, d3)), dim=-2)
 
 
 def director_energy(material: AbstractMaterial, n: Tensor, d3: Tensor) -> Tensor:
-    """[..., E, S, 1]."""
+    """Compute the energy density of the directors, [..., E, S, 1] J/m^2."""
     return material.director_energy(_per_point(material), n, d3)
 
 
 def return_map(material: AbstractMaterial, n: Tensor, d3: Tensor) -> Tensor:
-    """[..., E, S, 3]."""
+    """Apply the return map to directors, [..., E, S, 3]."""
     return material.return_map(_per_point(material), n, d3)
 
 
 def plastic_flow(material: AbstractMaterial, f1: Tensor, f2: Tensor) -> Tensor:
-    """Inelastic part [..., E, 4] of a virgin sheet that is brought to this deformation."""
-    virgin = material.initial_memory(f1.shape[-2])
-    if virgin is None:
+    """Compute A [..., E, 4], the inverse plastic set of a new sheet that is brought to this deformation."""
+    initial = material.initial_memory(f1.shape[-2])
+    if initial is None:
         raise AssertionError("a material without plastic set was asked for its flow")
-    return _flow(material, f1, f2, virgin.to(f1))
+    return _flow(material, f1, f2, initial.to(f1))
 
 
-def _flow(material: AbstractMaterial, f1: Tensor, f2: Tensor, inelastic: Tensor) -> Tensor:
-    trial1, trial2 = (torch.stack([f1, f2], dim=-1) @ inelastic.unflatten(-1, (2, 2))).unbind(-1)
-    return material.flow(material.coefficients(), samples.surface(trial1, trial2), inelastic)
+def _flow(material: AbstractMaterial, f1: Tensor, f2: Tensor, inverse_plastic: Tensor) -> Tensor:
+    trial1, trial2 = (torch.stack([f1, f2], dim=-1) @ inverse_plastic.unflatten(-1, (2, 2))).unbind(-1)
+    return material.flow(material.coefficients(), samples.surface(trial1, trial2), inverse_plastic)
 
 
 def _per_point(material: AbstractMaterial) -> Any:
@@ -68,14 +68,14 @@ def _per_point(material: AbstractMaterial) -> Any:
     return type(c)(*(value.unsqueeze(-2) for value in c))
 
 
-_UNTURNED = ("membrane_energy", "director_energy", "plastic_flow")  # scalars, or in the material's axes
+_INVARIANT_LAWS = ("membrane_energy", "director_energy", "plastic_flow")  # scalars, or in the material's axes
 
 
 class MaterialContract(Contract):
     """What the layer relies on in a material. Override ``make``, and the numbers if the law needs others.
 
     Attributes:
-        triangles: how many are tried; parameter fields of ``make`` must fit.
+        triangles: number of test triangles; parameter fields of ``make`` must fit.
         points: contact points per triangle.
         strain: size of the random strains.
     """
@@ -86,7 +86,7 @@ class MaterialContract(Contract):
 
     @abstractmethod
     def make(self) -> AbstractMaterial:
-        """A material with ordinary values, away from the borders of their domains."""
+        """Make a material with ordinary values, away from the borders of their domains."""
 
     def _material(self) -> AbstractMaterial:
         with float64():
@@ -113,7 +113,7 @@ class MaterialContract(Contract):
         }
 
     def test_rest_is_stress_free(self) -> None:
-        """An undeformed, arbitrarily turned triangle with its director along the normal pulls at nothing."""
+        """An undeformed, arbitrarily turned triangle with its director along the normal has no stress."""
         material = self._material()
         f1, f2 = samples.frames(self.triangles, 0.0, 3)
         n = samples.surface(f1, f2).n.unsqueeze(-2)
@@ -149,7 +149,7 @@ class MaterialContract(Contract):
         for name, (law, inputs) in self._laws().items():
             turned = law(material, *(value @ q.mT for value in inputs.values())).detach()
             expected = law(material, *inputs.values()).detach()
-            expected = expected if name in _UNTURNED else expected @ q.mT
+            expected = expected if name in _INVARIANT_LAWS else expected @ q.mT
             require_close(turned, expected, 1e-11, f"{name} changes when the frame is turned")
 
     def test_return_map_is_idempotent(self) -> None:
@@ -161,11 +161,11 @@ class MaterialContract(Contract):
     def test_plastic_flow_is_idempotent(self) -> None:
         """What has set does not set again under the same deformation; elastic materials have nothing to show."""
         material, (f1, f2) = self._material(), self._columns().values()
-        virgin = material.initial_memory(self.triangles)
-        if virgin is None:
+        initial = material.initial_memory(self.triangles)
+        if initial is None:
             return
         once = plastic_flow(material, f1, f2).detach()
-        require((once != virgin).any(), "nothing yields: give ``strain`` a size that does")
+        require((once != initial).any(), "nothing yields: give ``strain`` a size that does")
         require_close(_flow(material, f1, f2, once).detach(), once, 1e-12, "the plastic flow is not idempotent")
 
     def test_gradients_in_state_and_parameters(self) -> None:

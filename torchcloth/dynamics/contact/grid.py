@@ -83,9 +83,9 @@ class Grid(NamedTuple):
         unseen_fraction = 1 - len(np.unique(pairs[is_seen, 0])) / len(np.unique(pairs[:, 0]))
         if unseen_fraction > WARN_UNSEEN_LAYER_FRACTION:
             yield (
-                f"contact: {100 * unseen_fraction:.0f} % of the triangles that lie over another layer do not see it and "
-                f"pass through ({self.summary}): give contact=Contact.with_gap(...) a smaller gap, or the mesh more "
-                "triangles"
+                f"contact: {100 * unseen_fraction:.0f} % of the triangles that lie over another layer do not see it "
+                f"and pass through ({self.summary}): give contact=Contact.with_gap(...) a smaller gap, or the mesh "
+                "more triangles"
             )
 
 
