@@ -41,7 +41,7 @@ class Rim(NamedTuple):
 
     @property
     def piece_count(self) -> int:
-        """Number of pieces."""
+        """Number of the rim's pieces."""
         return len(self.labels)
 
 

@@ -24,7 +24,7 @@ from ..parameters import PhysicalParameter
 from ..recordings import Recording
 from .estimators import levenberg_marquardt
 from .estimators.objective import Objective
-from .estimators.search import CHAMFER_METHODS, METHODS, Method, Outcome, Progress, Search
+from .estimators.search import CHAMFER_METHODS, ESTIMATION_METHODS, Method, Outcome, Progress, Search
 from .fit_warnings import fit_warnings, warn_of_skew
 from .io.saved_fit import describe_model
 from .nuisances import add_lookahead, implied_nuisances, select_nuisances
@@ -158,8 +158,8 @@ def identify(
 
 
 def _check_options(method: str, stop: str, iterations: int, starts: int) -> None:
-    if method not in METHODS or stop not in ("converged", "paper"):
-        expected = f'{", ".join(map(repr, METHODS))}; "converged" or "paper"'
+    if method not in ESTIMATION_METHODS or stop not in ("converged", "paper"):
+        expected = f'{", ".join(map(repr, ESTIMATION_METHODS))}; "converged" or "paper"'
         raise InvalidInput("method or stop", got=f"{method!r}, {stop!r}", expected=expected)
     for name, number in (("iterations", iterations), ("starts", starts)):
         if not isinstance(number, int) or number < 1:

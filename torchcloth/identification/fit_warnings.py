@@ -62,7 +62,7 @@ def identifiability_warnings(estimates: EstimateSet) -> list[str]:
         for b in names[:i]:
             correlation = estimates.correlation[a][b]
             if abs(correlation) > FIT_WARNING_THRESHOLDS.max_correlation:
-                warnings.append(f"{a} and {b} can hardly be told apart (correlation {correlation:+.2f})")
+                warnings.append(f"{a} and {b} are confounded (correlation {correlation:+.2f})")
     return warnings
 
 

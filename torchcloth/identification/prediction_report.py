@@ -10,10 +10,10 @@ import numpy as np
 from .episode_prediction import EpisodePrediction
 from .estimators.levenberg_marquardt import NORMAL_QUANTILE_975
 from .pictures import AFTER_COLOUR, BEFORE_COLOUR, NULL_COLOUR
+from .tables import MIN_FIT_TABLE_COLUMNS
 from .tension.prediction import PredictionBand, TensionPrediction
 
 MAX_PRINTED_ROWS = 9  # of a curve
-MIN_TABLE_WIDTH = 112  # columns of the terminal
 MIN_RELATIVE_PART = 1e-6  # of the largest force, below which a part of the error is printed as 0
 
 
@@ -24,7 +24,7 @@ def print_tension_prediction(prediction: TensionPrediction) -> None:
     from rich.table import Table
 
     console = Console(highlight=False)
-    console.width = max(console.width, MIN_TABLE_WIDTH)
+    console.width = max(console.width, MIN_FIT_TABLE_COLUMNS)
     t, lateral = prediction.table, prediction.lateral_strain
     size = f"{1e3 * t.length:g} mm x {1e3 * t.width:g} mm, preload {t.preload:.3g} N"
     title = f"Strip at {math.degrees(t.angle):g} degrees to the warp, {size}"
@@ -91,9 +91,9 @@ def print_episode_prediction(prediction: EpisodePrediction) -> None:
     from rich.table import Table
 
     console, f, content = Console(highlight=False), prediction.metrics, prediction.as_dict()
-    own = content["std_parameters"]
+    std = content["std_parameters"]
     print(f"{prediction.episode.name}: {content['frames']} frames, {len(prediction.cloth.mesh.faces)} triangles")
-    print(f"by parameters: a vertex is known to {1e3 * own['rms']:.2g} mm (rms; at most {1e3 * own['max']:.2g} mm)")
+    print(f"by parameters: a vertex is known to {1e3 * std['rms']:.2g} mm (rms; at most {1e3 * std['max']:.2g} mm)")
     if math.isfinite(prediction.misfit_std):
         print(
             f"by the misfit: the fit left {1e3 * prediction.misfit_std:.2g} mm rms in its own episodes, noise included"
@@ -107,7 +107,7 @@ def print_episode_prediction(prediction: EpisodePrediction) -> None:
     for warning in prediction.warnings:
         print(f"warning: {warning}")
     columns = {"rms mm": ("rms", 1e3), "Chamfer mm": ("chamfer", 1e3), "force rms N": ("force_rms", 1.0)}
-    known = {heading: own for heading, own in columns.items() if math.isfinite(f.get(own[0], math.nan))}
+    known = {heading: (key, unit) for heading, (key, unit) in columns.items() if math.isfinite(f.get(key, math.nan))}
     if not known:
         print("the episode has no data to compare with")
         return

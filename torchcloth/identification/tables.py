@@ -12,7 +12,7 @@ from .uncertainty.estimates import Estimate
 if TYPE_CHECKING:
     from rich.table import Table
 
-MIN_TABLE_WIDTH = 112  # columns of the terminal
+MIN_FIT_TABLE_COLUMNS = 112  # of the terminal
 PARAMETER_COLUMN_SIDES = {
     "parameter": "left",
     "start": "right",
@@ -31,7 +31,7 @@ def print_fit(fit: Identification) -> None:
     from rich.console import Console
 
     console = Console(highlight=False)
-    console.width = max(console.width, MIN_TABLE_WIDTH)
+    console.width = max(console.width, MIN_FIT_TABLE_COLUMNS)
     absent = [name for name, e in fit.parameters.items() if e.source == "not in the model"]
     console.print(_parameters(fit.parameters))
     if absent:
@@ -118,7 +118,7 @@ def print_tension(fit: TensionFit) -> None:
     from rich.table import Table
 
     console = Console(highlight=False)
-    console.width = max(console.width, MIN_TABLE_WIDTH)
+    console.width = max(console.width, MIN_FIT_TABLE_COLUMNS)
     console.print(_parameters(fit.parameters))
     table = Table(title="Errors, % of a table's largest reading", title_justify="left", box=box.SIMPLE_HEAD)
     for heading in ("table", "force rms: start", "fitted", "largest", "lateral strain rms: start", "fitted", "largest"):

@@ -6,7 +6,7 @@ import math
 
 from .result import PoseEstimate
 
-MIN_TABLE_WIDTH = 100  # columns of the terminal
+MIN_POSE_TABLE_COLUMNS = 100  # of the terminal
 DISTANCE_ROW_LABELS = {
     "null": "null: carried rigidly",
     "uncorrected": "simulated, no correction",
@@ -21,7 +21,7 @@ def print_pose(estimate: PoseEstimate) -> None:
     from rich.table import Table
 
     console, fit = Console(highlight=False), estimate.fit
-    console.width = max(console.width, MIN_TABLE_WIDTH)
+    console.width = max(console.width, MIN_POSE_TABLE_COLUMNS)
     table = Table(title="Distance cloud to surface, one-sided, mm", title_justify="left", box=box.SIMPLE_HEAD)
     for heading in ("", "Chamfer", "rms"):
         table.add_column(heading, justify="right" if heading else "left", no_wrap=True)

@@ -103,7 +103,7 @@ def check_linearity(
 def has_runaway_tangents(
     objective: Objective, at: levenberg_marquardt.Iterate, criteria: LinearityCriteria = LINEARITY_CRITERIA
 ) -> bool:
-    """Whether tangents are so long that they describe no motion: a longest step moves the cloth by its own size."""
+    """Tell whether tangents are too long to describe a motion: a longest step moves the cloth by its own size."""
     is_position = torch.tensor([block.unit == "m" for block in objective.blocks])[at.linear.blocks]
     rows = at.linear.jacobian[is_position][:, : len(objective.unknowns)]
     if not len(rows):

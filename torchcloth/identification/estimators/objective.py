@@ -20,7 +20,7 @@ from ...episodes.unknowns import Unknown
 from ...errors import InvalidInput, SimulationDiverged, UnstableStep
 from ...parameters import PhysicalParameter
 from ..nuisances import AbstractNuisance, NuisanceSlice, add_lookahead, place_nuisances
-from ..residuals.blocks import BLOCKS, BLOCKS_BY_DATA_KIND, Block, check_noise_floors
+from ..residuals.blocks import BLOCKS_BY_DATA_KIND, RESIDUAL_BLOCKS, Block, check_noise_floors
 from ..residuals.metrics import DistanceMetrics, distance_metrics, force_rms, huber
 from ..residuals.rows import ResidualRows, match_points
 from ..uncertainty.identifiability import ParameterInfluence
@@ -65,7 +65,7 @@ class Objective:
         episodes: Sequence[Episode],
         dt: float | None = None,
         nuisances: Sequence[AbstractNuisance] = (),
-        blocks: Sequence[Block] = BLOCKS,
+        blocks: Sequence[Block] = RESIDUAL_BLOCKS,
         noise_floors: Mapping[str, float] | None = None,
     ) -> None:
         self.cloth, self.unknowns, self.episodes, self.dt = cloth, list(unknowns), list(episodes), dt

@@ -16,8 +16,8 @@ from .gradient_descent import chamfer_to_nearest_vertex, minimise_by_gradient_de
 from .objective import Objective
 
 Method = Literal["gauss-newton", "lbfgs", "adam", "gradient-descent"]
-METHODS: tuple[str, ...] = ("gauss-newton", "lbfgs", "adam", "gradient-descent")
-CHAMFER_METHODS = METHODS[2:]  # these minimise the paper's distance alone
+ESTIMATION_METHODS: tuple[str, ...] = ("gauss-newton", "lbfgs", "adam", "gradient-descent")
+CHAMFER_METHODS = ESTIMATION_METHODS[2:]  # these minimise the paper's distance alone
 PAPER_STOP_CHAMFER_M = 0.015  # stop rule of the DiffCP paper
 EARLY_FRAME_FRACTION = 0.35  # of the frames, in the first stage of the fit
 MAX_EARLY_ITERATIONS = 10
@@ -78,7 +78,7 @@ class Search:
         """Search from ``start`` [K], or from ``count`` starts around it, to the end.
 
         Args:
-            method: one of ``METHODS``.
+            method: one of ``ESTIMATION_METHODS``.
             start: [K].
             iterations: largest number of steps on all frames.
             rate: of gradient descent.

@@ -110,7 +110,7 @@ def torque_rows(scene: SimulatedEpisode) -> ResidualRows | None:
 
 
 OUTLIER_DISTANCE_M = 0.02
-BLOCKS = (
+RESIDUAL_BLOCKS = (
     Block("points", "m", 1e-6, OUTLIER_DISTANCE_M, point_rows),
     Block("edges", "m", 1e-4, OUTLIER_DISTANCE_M, edge_rows),
     Block("markers", "m", 1e-4, OUTLIER_DISTANCE_M, marker_rows),
@@ -131,7 +131,7 @@ def select_blocks(uses: Sequence[str] | str | None) -> tuple[Block, ...]:
         if use not in BLOCKS_BY_DATA_KIND:
             raise InvalidInput("use", got=repr(use), expected=f"some of {', '.join(BLOCKS_BY_DATA_KIND)}")
     names = [name for use in uses or BLOCKS_BY_DATA_KIND for name in BLOCKS_BY_DATA_KIND[use]]
-    return tuple(block for block in BLOCKS if block.name in names)
+    return tuple(block for block in RESIDUAL_BLOCKS if block.name in names)
 
 
 def check_noise_floors(noise: Mapping[str, float] | None) -> dict[str, float]:
@@ -140,7 +140,7 @@ def check_noise_floors(noise: Mapping[str, float] | None) -> dict[str, float]:
     Raises:
         InvalidInput: a name that is no block, or a number that is not positive and finite.
     """
-    names = [block.name for block in BLOCKS]
+    names = [block.name for block in RESIDUAL_BLOCKS]
     for name, std in (noise or {}).items():
         if name not in names:
             raise InvalidInput("noise", got=repr(name), expected=f"some of {', '.join(names)}")

@@ -35,7 +35,7 @@ COMBINATION_CRITERIA = CombinationCriteria()
 STATED_VALUE_FRACTION = 0.1  # of a parameter's value, whose effect is reported
 
 # What determines a parameter, in the order of the first name that fits.
-EXPERIMENTS = (
+EXPERIMENT_BY_PARAMETER = (
     ("*modulus", "stretch it by some 5 % between two grippers that measure force; once along each axis and the bias"),
     ("*stiffening", "stretch it until it is taut, with force readings"),
     ("poisson_ratio", "stretch it with the free edges, or markers, in view"),
@@ -137,7 +137,9 @@ def find_combinations(
 
 def suggest_experiment(name: str) -> str:
     """Return a motion that would determine a parameter."""
-    return next((text for pattern, text in EXPERIMENTS if fnmatch(name, pattern)), "a motion that moves it more")
+    return next(
+        (text for pattern, text in EXPERIMENT_BY_PARAMETER if fnmatch(name, pattern)), "a motion that moves it more"
+    )
 
 
 def _raw_change_per_value(unknown: Unknown, raw: float) -> float:
