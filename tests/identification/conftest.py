@@ -1,6 +1,5 @@
 """One twin episode, and one fit of it, for all tests of this folder."""
 
-
 import pytest
 from helpers import twins
 

@@ -83,9 +83,9 @@ def test_the_distance_is_from_what_is_in_use(pulled, model, use):
         kind: Objective(model, unknowns, [build_episode(model, recording)], blocks=select_blocks(use))
         for kind, recording in {"as it is": pulled, **off}.items()
     }
-    found = {kind: objective.mean_distance(objective.start) for kind, objective in asked.items()}
-    assert [kind for kind in off if found[kind] > 2 * found["as it is"]] == [use]
-    assert [kind for kind in off if found[kind] == found["as it is"]] == [kind for kind in off if kind != use]
+    result = {kind: objective.mean_distance(objective.start) for kind, objective in asked.items()}
+    assert [kind for kind in off if result[kind] > 2 * result["as it is"]] == [use]
+    assert [kind for kind in off if result[kind] == result["as it is"]] == [kind for kind in off if kind != use]
 
 
 def test_neither_points_nor_markers_nor_forces_is_refused(pulled, model):

@@ -29,11 +29,11 @@ def clouds(larger, generator, density=5000.0, blur=0.0, hidden=None):
     return out
 
 
-def scene(cloud, moved=None, length=0.1, mesh=MESH, held=None):
+def scene(cloud, moved=None, length=0.1, mesh=MESH, gripped=None):
     x = torch.as_tensor(mesh.vertices).expand(len(cloud), -1, -1)
     nothing = x.new_zeros(len(cloud))
     episode = Episode("fake", {}, torch.arange(len(cloud)) * 0.1, cloud, x[0], True, 1e-3)
-    return match_points(Frames(x, 0 * x, {}, nothing), moved, episode, build_surface_of_mesh(mesh, held, length))
+    return match_points(Frames(x, 0 * x, {}, nothing), moved, episode, build_surface_of_mesh(mesh, gripped, length))
 
 
 def offset(cloud, **options):
@@ -46,24 +46,24 @@ def offset(cloud, **options):
 @pytest.mark.parametrize("larger", [-8e-3, -2e-3, 0.0, 2e-3, 8e-3])
 def test_the_rim_is_where_the_points_end(larger):
     """Inside as well as outside; a ratio of means is biased by some h / (6 n): 0.1 mm of 25 points a piece."""
-    found, error = offset(clouds(larger, torch.Generator().manual_seed(0)))
+    result, error = offset(clouds(larger, torch.Generator().manual_seed(0)))
     assert error < 0.2e-3
-    assert found == pytest.approx(larger, abs=3 * error + 0.15e-3)
+    assert result == pytest.approx(larger, abs=3 * error + 0.15e-3)
 
 
 def test_noise_moves_the_rim_by_twice_its_variance_over_the_band():
     """As the file's head says: 2 mm of noise, 0.5 mm."""
     generator = torch.Generator().manual_seed(0)
-    found, error = offset(clouds(0.0, generator, blur=2e-3))
-    assert found == pytest.approx(2 * (2e-3) ** 2 / RIM_BAND_M, abs=3 * error + 0.15e-3)
+    result, error = offset(clouds(0.0, generator, blur=2e-3))
+    assert result == pytest.approx(2 * (2e-3) ** 2 / RIM_BAND_M, abs=3 * error + 0.15e-3)
 
 
 def test_what_is_hidden_does_not_pull():
     """A bar across the sheet hides a third of two sides."""
-    found, error = offset(
+    result, error = offset(
         clouds(0.0, torch.Generator().manual_seed(0), hidden=lambda uv: (uv[:, 0] - 0.15).abs() < 0.05)
     )
-    assert found == pytest.approx(0.0, abs=3 * error + 0.15e-3)
+    assert result == pytest.approx(0.0, abs=3 * error + 0.15e-3)
 
 
 def test_a_piece_without_points_says_nothing():
@@ -86,8 +86,8 @@ def test_the_slope_is_that_of_the_rim():
 
 
 def test_held_sides_are_no_rim():
-    held = MESH.vertices_near_pattern_points([[0.0, v / 20 * SIDE] for v in range(21)], 0.01)
-    assert build_surface_of_mesh(MESH, held, 0.1).rim.piece_count == 9
+    gripped = MESH.vertices_near_pattern_points([[0.0, v / 20 * SIDE] for v in range(21)], 0.01)
+    assert build_surface_of_mesh(MESH, gripped, 0.1).rim.piece_count == 9
     assert build_surface_of_mesh(MESH, None, 0.1).rim.piece_count == 12
 
 
@@ -103,7 +103,9 @@ def test_another_layer_is_not_beyond_the_rim():
     faces = torch.as_tensor(MESH.faces)[torch.randint(len(MESH.faces), (FRAMES, 600), generator=generator)]
     cloud = list((weights.unsqueeze(-1) * x[faces]).sum(-2))
     given = scene(cloud)
-    rows = edge_rows(match_points(given.frames._replace(x=x.expand(FRAMES, -1, -1)), None, given.episode, given.surface))
+    rows = edge_rows(
+        match_points(given.frames._replace(x=x.expand(FRAMES, -1, -1)), None, given.episode, given.surface)
+    )
     seen = rows.residual[rows.residual != 0]
     assert abs(float(seen.mean())) < 1.5e-3
 

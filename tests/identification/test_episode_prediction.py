@@ -27,21 +27,21 @@ def other():
 
 
 @pytest.fixture(scope="module")
-def found(pair, other, tmp_path_factory):
+def result(pair, other, tmp_path_factory):
     with twins.doubles():
         return predict_episode(pair.save(tmp_path_factory.mktemp("fit")), other)
 
 
-def test_what_was_not_fitted_is_as_near_as_what_was(found, pair):
+def test_what_was_not_fitted_is_as_near_as_what_was(result, pair):
     """Noise of 1 mm; the null is far off."""
-    assert found.figures["rms"] < 1.2 * pair.fit["rms_after"]
-    assert found.figures["rms"] < 0.3 * found.figures["rms_null"]
-    assert found.law == pair.fit["rms_after"]
+    assert result.figures["rms"] < 1.2 * pair.fit["rms_after"]
+    assert result.figures["rms"] < 0.3 * result.figures["rms_null"]
+    assert result.law == pair.fit["rms_after"]
 
 
-def test_the_error_is_that_of_finite_steps(found, pair, other):
+def test_the_error_is_that_of_finite_steps(result, pair, other):
     """A tenth of a standard error of each parameter, with their correlation, through whole simulations."""
-    cloth = found.cloth
+    cloth = result.cloth
     unknowns = collect_unknowns(cloth, list(pair.correlation), None)
     raw = torch.tensor([u.start for u in unknowns])
     std = torch.tensor([pair.parameters[u.name].std / u.slope(u.start) for u in unknowns])
@@ -52,17 +52,17 @@ def test_the_error_is_that_of_finite_steps(found, pair, other):
         moved = torch.stack([simulate(cloth, unknowns, raw + step, data).x - centre for step in steps]) / 0.1
     matrix = torch.tensor([[pair.correlation[a.name][b.name] for b in unknowns] for a in unknowns])
     expected = torch.einsum("ktvc,kl,ltvc->tv", moved, matrix, moved).sqrt()
-    assert found.std.shape == expected.shape
-    assert float((found.std - expected).abs().max()) < 0.02 * float(expected.max())
-    assert float(found.std[0].max()) < float(found.std.max())
+    assert result.std.shape == expected.shape
+    assert float((result.std - expected).abs().max()) < 0.02 * float(expected.max())
+    assert float(result.std[0].max()) < float(result.std.max())
 
 
-def test_the_interval_holds_what_is_measured(found, pair):
+def test_the_interval_holds_what_is_measured(result, pair):
     """Of the whole: parameters and what the fit left; of 960 points with 1 mm of noise, one in twenty is outside."""
-    assert 0.92 < found.inside < 0.98
-    assert found.interval.shape == (8, len(found.cloth.mesh.faces))
-    assert float(found.interval.min()) >= 1.959 * pair.fit["rms_after"]
-    assert float(found.interval.max()) <= 1.97 * (pair.fit["rms_after"] + float(found.std.max()))
+    assert 0.92 < result.inside < 0.98
+    assert result.interval.shape == (8, len(result.cloth.mesh.faces))
+    assert float(result.interval.min()) >= 1.959 * pair.fit["rms_after"]
+    assert float(result.interval.max()) <= 1.97 * (pair.fit["rms_after"] + float(result.std.max()))
 
 
 def test_only_forces_are_compared_where_there_is_nothing_else(pair, other, tmp_path, capsys):
@@ -76,27 +76,27 @@ def test_only_forces_are_compared_where_there_is_nothing_else(pair, other, tmp_p
     assert felt.as_dict()["interval"]["coverage"] is None
 
 
-def test_what_it_says_is_json(found):
-    content = json.loads(json.dumps(found.as_dict(), allow_nan=False))
+def test_what_it_says_is_json(result):
+    content = json.loads(json.dumps(result.as_dict(), allow_nan=False))
     assert content["frames"] == 8
     assert 0 < content["std_parameters"]["rms"] <= content["std_parameters"]["max"]
 
 
 def test_what_nobody_has_seen_yet_is_predicted_along_its_motion(pair, other, tmp_path, capsys):
     """Where the frames are does not matter to where the cloth goes, but for the intervals that are integrated."""
-    found, seen = (predict_episode(pair.save(tmp_path), e) for e in (replace(other, points=None), other))
-    start = float(next(iter(found.episode.motion.values())).t[0])
-    torch.testing.assert_close(found.episode.times[:3], start + torch.tensor([0.0, 0.05, 0.1]))
-    same = (seen.episode.times - found.episode.times[:, None]).abs() < 1e-9
+    result, seen = (predict_episode(pair.save(tmp_path), e) for e in (replace(other, points=None), other))
+    start = float(next(iter(result.episode.motion.values())).t[0])
+    torch.testing.assert_close(result.episode.times[:3], start + torch.tensor([0.0, 0.05, 0.1]))
+    same = (seen.episode.times - result.episode.times[:, None]).abs() < 1e-9
     k, known = same.nonzero(as_tuple=True)
     assert len(k) > 3
-    torch.testing.assert_close(found.frames.x[k], seen.frames.x[known], atol=1e-6, rtol=0)
+    torch.testing.assert_close(result.frames.x[k], seen.frames.x[known], atol=1e-6, rtol=0)
     brief = {name: replace(g, t=0.01 * g.t) for name, g in other.grippers.items()}
     with pytest.raises(RecordingError, match=r"at least 0\.05 s"):
         predict_episode(pair.save(tmp_path), replace(other, points=None, grippers=brief))
-    assert found.as_dict()["std_parameters"]["rms"] > 0
-    assert set(found.as_dict()["measured"].values()) == {None}
-    print_episode_prediction(found)
+    assert result.as_dict()["std_parameters"]["rms"] > 0
+    assert set(result.as_dict()["measured"].values()) == {None}
+    print_episode_prediction(result)
     assert "nothing was seen or felt in this episode to compare with" in capsys.readouterr().out
 
 
@@ -137,9 +137,11 @@ def test_tangents_of_an_unstable_motion_are_replace_wrong_tangents():
         data, unknowns = build_episode(cloth, swing), collect_unknowns(cloth, ["youngs_modulus", "air.normal"], None)
         raw, covariance = torch.tensor([u.start for u in unknowns]), torch.diag(torch.tensor([0.02, 0.03]) ** 2)
         both = simulate_with_tangents(cloth, unknowns, raw, data)
-        moved, lost, untried = _replace_wrong_tangents(cloth, unknowns, raw, data, None, both, covariance)
-        before, after = (propagate_errors(cloth, data, both[0], m, covariance, 1e-3).vertex_std for m in (both[1], moved))
-    assert lost
+        moved, missing, untried = _replace_wrong_tangents(cloth, unknowns, raw, data, None, both, covariance)
+        before, after = (
+            propagate_errors(cloth, data, both[0], m, covariance, 1e-3).vertex_std for m in (both[1], moved)
+        )
+    assert missing
     assert not untried
     assert float(after.max()) < 0.2
     assert float(before[-1].square().mean()) > 100 * float(after[-1].square().mean())
@@ -159,9 +161,9 @@ def test_a_standard_error_more_that_cannot_be_simulated_is_tried_as_one_less(mon
 
     monkeypatch.setattr(episode_prediction, "simulate", simulate)
     slopes = Frames(*(torch.zeros(1, *part.shape) for part in still[:2]), {}, torch.zeros(1, 2))
-    moved, lost, untried = _replace_wrong_tangents(
+    moved, missing, untried = _replace_wrong_tangents(
         None, [unknown], torch.zeros(1), None, None, still, slopes, torch.eye(1) * std**2
     )
     assert tried == [1, -1]
-    assert (lost, untried) == ((["stiffness"], []) if possible else ([], ["stiffness"]))
+    assert (missing, untried) == ((["stiffness"], []) if possible else ([], ["stiffness"]))
     assert float(moved.x.mean()) == pytest.approx(2.0 if possible else 0.0)

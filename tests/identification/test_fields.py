@@ -58,11 +58,11 @@ def test_a_stiff_stripe_is_seen_from_another_mesh(striped):
     recording = striped(frames=5, points=600)
     model = start(recording)
     fit = fit_fields(model, recording, ["youngs_modulus"], iterations=90)
-    found, stripe = fit.fields["youngs_modulus"], in_stripe(model.mesh)
-    correlation = float(np.corrcoef(found.log(), stripe.double())[0, 1])
-    print(f"correlation {correlation:.3f}, {found[stripe].mean():.4g} and {found[~stripe].mean():.4g} Pa, {fit.fit}")
+    result, stripe = fit.fields["youngs_modulus"], in_stripe(model.mesh)
+    correlation = float(np.corrcoef(result.log(), stripe.double())[0, 1])
+    print(f"correlation {correlation:.3f}, {result[stripe].mean():.4g} and {result[~stripe].mean():.4g} Pa, {fit.fit}")
     assert correlation > 0.8
-    assert float(found[stripe].median() / found[~stripe].median()) > 2.0
+    assert float(result[stripe].median() / result[~stripe].median()) > 2.0
 
 
 def test_a_field_goes_downhill_and_says_that_it_has_no_error(striped, tmp_path):
@@ -160,8 +160,8 @@ def test_pieces_of_cloth_that_do_not_touch_have_a_prior_each():
         np.concatenate([one.vertices, np.asarray(one.vertices) + np.array([0.2, 0.0, 0.0])]), faces
     )
     cloth = with_field(tc.Cloth(two, tc.materials.AEP(1e5, 0.3), 0.2), torch.full((len(faces),), 1e5))
-    own = {"youngs_modulus": cloth.material.youngs_modulus}
-    prior = fields._FieldObjective(cloth, own, [], None, select_blocks(None), 1.0).root
+    of_part = {"youngs_modulus": cloth.material.youngs_modulus}
+    prior = fields._FieldObjective(cloth, of_part, [], None, select_blocks(None), 1.0).root
     covariance = torch.linalg.inv(prior @ prior.mT)
     count = len(one.faces)
     assert float(covariance[:count, :count].mean()) == pytest.approx(math.log(10) ** 2)
@@ -175,7 +175,7 @@ def test_where_clouds_end_is_no_datum_of_a_field(striped, monkeypatch):
     class Stop(Exception):
         pass
 
-    def made(cloth, own, episodes, dt, blocks, contrast):
+    def made(cloth, of_part, episodes, dt, blocks, contrast):
         seen.append([block.name for block in blocks])
         raise Stop
 

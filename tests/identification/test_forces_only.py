@@ -13,8 +13,13 @@ from helpers import stretched_sheets, twins
 from torchcloth.episodes import streams
 from torchcloth.episodes.replay import Frames
 from torchcloth.errors import InvalidInput, RecordingError
-from torchcloth.identification import build_cloth, save_fit_pictures, build_episode, identify, print_fit, replay_fit
-from torchcloth.identification.residuals.rigid_carry import CARRIED_NULL, STATIC_NULL, ZERO_FORCE_NULL, find_unbeaten_null
+from torchcloth.identification import build_cloth, build_episode, identify, print_fit, replay_fit, save_fit_pictures
+from torchcloth.identification.residuals.rigid_carry import (
+    CARRIED_NULL,
+    STATIC_NULL,
+    ZERO_FORCE_NULL,
+    find_unbeaten_null,
+)
 
 STIFFNESS = ["youngs_modulus"]
 
@@ -22,7 +27,9 @@ STIFFNESS = ["youngs_modulus"]
 @pytest.fixture(scope="module")
 def felt():
     with twins.doubles():
-        return replace(stretched_sheets.record(seed=5, setting=stretched_sheets.Setting(frames=9, strain=0.08)), points=None)
+        return replace(
+            stretched_sheets.record(seed=5, setting=stretched_sheets.Setting(frames=9, strain=0.08)), points=None
+        )
 
 
 @pytest.fixture(scope="module")
@@ -32,10 +39,10 @@ def fit(felt):
 
 
 def test_forces_alone_tell_stiffness(fit):
-    found = fit.parameters["membrane_stiffness"]
-    assert found.identifiable
-    assert found.value == pytest.approx(60.0, rel=0.05)
-    assert abs(found.value - 60.0) < 3 * found.std
+    result = fit.parameters["membrane_stiffness"]
+    assert result.identifiable
+    assert result.value == pytest.approx(60.0, rel=0.05)
+    assert abs(result.value - 60.0) < 3 * result.std
 
 
 def test_forces_are_compared_with_their_own_nulls(fit, felt):
@@ -86,29 +93,29 @@ def test_its_pictures_show_forces(fit, felt, tmp_path):
 def test_a_fit_is_held_against_the_null_of_the_data_that_tell(felt):
     """Cloth that hangs still lies where it lay, whatever it is: only force tells of it, and only where it is in use."""
     model = build_cloth(felt)
-    own = build_episode(model, felt)
-    here = [own.initial + 1e-4 * torch.randn(400, *own.initial.shape)[0] for _ in own.times]
+    of_part = build_episode(model, felt)
+    here = [of_part.initial + 1e-4 * torch.randn(400, *of_part.initial.shape)[0] for _ in of_part.times]
     still = replace(
-        own,
-        motion={n: m._replace(pose=m.pose[:1].expand_as(m.pose)) for n, m in own.motion.items()},
+        of_part,
+        motion={n: m._replace(pose=m.pose[:1].expand_as(m.pose)) for n, m in of_part.motion.items()},
         clouds=here,
     )
-    moved = replace(own, clouds=[x + torch.tensor([0.0, 0.0, 0.1]) for x in here])
+    moved = replace(of_part, clouds=[x + torch.tensor([0.0, 0.0, 0.1]) for x in here])
 
-    def told(data, *kinds, force=1.0, shift=0.0):
+    def informed(data, *kinds, force=1.0, shift=0.0):
         uses = lambda *asked: not set(asked).isdisjoint(kinds)  # noqa: E731
         scene = SimpleNamespace(uses=uses, episodes=[data], faces=torch.as_tensor(model.mesh.faces))
         x = torch.stack(list(data.clouds)) + shift
         wrench = {n: force * w.nan_to_num() for n, w in data.wrenches.items()}
         return find_unbeaten_null(scene, [Frames(x, 0 * x, wrench, torch.zeros(len(x), 0))])
 
-    assert told(still, "points", "force") == ""
-    assert told(still, "points", "force", force=-1.0) == ZERO_FORCE_NULL
-    assert told(still, "points") == ""
-    assert told(still, "points", shift=0.5) == STATIC_NULL
-    assert told(moved, "points", "force", force=-1.0) == ""
-    assert told(moved, "points", "force", shift=0.5) == CARRIED_NULL
-    assert told(moved, "force", shift=0.5) == ""
+    assert informed(still, "points", "force") == ""
+    assert informed(still, "points", "force", force=-1.0) == ZERO_FORCE_NULL
+    assert informed(still, "points") == ""
+    assert informed(still, "points", shift=0.5) == STATIC_NULL
+    assert informed(moved, "points", "force", force=-1.0) == ""
+    assert informed(moved, "points", "force", shift=0.5) == CARRIED_NULL
+    assert informed(moved, "force", shift=0.5) == ""
 
 
 @pytest.mark.parametrize("options", [{"method": "adam"}, {"stop": "paper"}])

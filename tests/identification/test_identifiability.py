@@ -10,7 +10,12 @@ from helpers import stretched_sheets, twins
 from torchcloth.episodes.unknowns import collect_unknowns
 from torchcloth.identification import identify
 from torchcloth.identification.uncertainty.estimates import Estimate
-from torchcloth.identification.uncertainty.identifiability import ParameterInfluence, find_combinations, suggest_experiment, describe_influences
+from torchcloth.identification.uncertainty.identifiability import (
+    ParameterInfluence,
+    describe_influences,
+    find_combinations,
+    suggest_experiment,
+)
 
 NAMES = ("youngs_modulus", "areal_density", "air.normal")
 
@@ -32,8 +37,8 @@ def after(information, unknowns):
 def test_a_ratio_that_alone_is_known_is_named(unknowns):
     """ln E - ln rho to 2 %, nothing else: positions without force."""
     slope = torch.tensor([1.0, -1.0, 0.0])
-    found = find_combinations(unknowns, start(unknowns), after(torch.outer(slope, slope) / 0.02**2, unknowns))
-    known = [c for c in found if c.determined]
+    result = find_combinations(unknowns, start(unknowns), after(torch.outer(slope, slope) / 0.02**2, unknowns))
+    known = [c for c in result if c.determined]
     assert len(known) == 1
     assert set(known[0].powers) == {"youngs_modulus", "areal_density"}
     assert known[0].powers["youngs_modulus"] * known[0].powers["areal_density"] == pytest.approx(-1.0, rel=1e-6)
@@ -65,14 +70,14 @@ def test_a_singular_covariance_has_no_combinations(unknowns):
 def test_reach_is_told_in_millimetres_and_newtons(unknowns):
     reach = ParameterInfluence(torch.tensor([2e-3, 1e-3, 0.0]), torch.tensor([0.5, 0.0, 0.0]))
     known = {n: Estimate(1.0, 0.1, (0.8, 1.2), "-", 1.0, n == "youngs_modulus") for n in NAMES}
-    found = describe_influences(unknowns, start(unknowns), reach, known)
-    assert found["youngs_modulus"].displacement_per_10_percent_mm == pytest.approx(0.2)  # of the logarithm
-    assert found["youngs_modulus"].force_per_10_percent_n == pytest.approx(0.05)
-    assert found["youngs_modulus"].displacement_per_prior_std_mm == pytest.approx(2 * math.log(10))
-    assert found["youngs_modulus"].experiment == ""
-    assert found["areal_density"].statement == "not identifiable from these data"
-    assert "weigh" in found["areal_density"].experiment
-    assert found["air.normal"].statement == "no effect on these data"
+    result = describe_influences(unknowns, start(unknowns), reach, known)
+    assert result["youngs_modulus"].displacement_per_10_percent_mm == pytest.approx(0.2)  # of the logarithm
+    assert result["youngs_modulus"].force_per_10_percent_n == pytest.approx(0.05)
+    assert result["youngs_modulus"].displacement_per_prior_std_mm == pytest.approx(2 * math.log(10))
+    assert result["youngs_modulus"].experiment == ""
+    assert result["areal_density"].statement == "not identifiable from these data"
+    assert "weigh" in result["areal_density"].experiment
+    assert result["air.normal"].statement == "no effect on these data"
 
 
 def test_every_parameter_has_an_experiment():

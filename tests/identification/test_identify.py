@@ -136,10 +136,10 @@ def test_apply_sets_what_is_identifiable_and_nothing_else(fitted, recording):
     assert fit.apply(cloth) is cloth
     assert cloth.material.youngs_modulus.value.item() == pytest.approx(fit.parameters["youngs_modulus"].value)
     assert cloth.effects["air"].normal.value.item() == pytest.approx(fit.parameters["air.normal"].value)
-    kept = {fit.keys[n] + ".raw" for n, e in fit.parameters.items() if n in fit.keys and not e.identifiable}
-    assert "effects.bending.stiffness.raw" in kept
+    stored = {fit.keys[n] + ".raw" for n, e in fit.parameters.items() if n in fit.keys and not e.identifiable}
+    assert "effects.bending.stiffness.raw" in stored
     untouched = (
-        kept
+        stored
         | {"effects.gravity.acceleration", "effects.gravity.tilt"}
         | {"effects.air.tangential.raw", "effects.air.wind", "effects.bending.damping_time.raw"}
         | {f"material.{name}.raw" for name in ("contact_stiffness", "shear_stiffness", "cone")}
@@ -213,10 +213,10 @@ def test_no_search_that_never_moved_presents_its_start_as_the_answer(model, brie
     """DiffCloth, issue 24: the start value came back as the result. Here the way that is left is in the error."""
     monkeypatch.setattr(search, "PAPER_STOP_CHAMFER_M", 1.0)
     fit = identify(model, brief, ["youngs_modulus"], **options)
-    found = fit.parameters["youngs_modulus"]
-    assert found.value == pytest.approx(found.initial)  # twice the truth
-    assert not found.identifiable
-    assert found.ci95[0] < TRUE.membrane / THICKNESS < found.ci95[1]
+    result = fit.parameters["youngs_modulus"]
+    assert result.value == pytest.approx(result.initial)  # twice the truth
+    assert not result.identifiable
+    assert result.ci95[0] < TRUE.membrane / THICKNESS < result.ci95[1]
     assert fit.apply(at(brief)).material.youngs_modulus.value.item() == pytest.approx(8e4)  # as the data sheet has it
 
 
@@ -270,8 +270,8 @@ def test_the_density_was_weighed_wherever_the_fit_starts(recording):
     made = recording
     cloth = at(made)
     cloth.areal_density.set(1.3 * made.cloth.areal_density)
-    found = identify(cloth, made, ["youngs_modulus", "air.normal"]).parameters["areal_density"]
-    assert found.value == pytest.approx(made.cloth.areal_density, abs=3 * made.cloth.areal_density_std)
+    result = identify(cloth, made, ["youngs_modulus", "air.normal"]).parameters["areal_density"]
+    assert result.value == pytest.approx(made.cloth.areal_density, abs=3 * made.cloth.areal_density_std)
 
 
 @pytest.mark.parametrize("method", ["gauss-newton", "adam"])
@@ -281,8 +281,8 @@ def test_a_fit_takes_gradients_of_its_own(model, brief, one_step, method):
     wanted = (one_step if method == "gauss-newton" else ask()).parameters["youngs_modulus"]
     for mode in (torch.no_grad, torch.inference_mode, lambda: torch.autocast("cpu", torch.bfloat16)):
         with mode():
-            found = ask().parameters["youngs_modulus"]
-        assert (found.value, found.std) == (wanted.value, wanted.std)
+            result = ask().parameters["youngs_modulus"]
+        assert (result.value, result.std) == (wanted.value, wanted.std)
 
 
 def test_a_path_is_no_recording(model, tmp_path):

@@ -26,16 +26,18 @@ def answer(number):
 
 
 def test_an_answer_is_computed_once(tmp_path):
-    kept = ResumableStore(tmp_path / "j", ["a"], resume=False)
-    assert float(kept.get_or_compute("rows", POINT, answer(1.0))[0]) == 1.0
+    stored = ResumableStore(tmp_path / "j", ["a"], resume=False)
+    assert float(stored.get_or_compute("rows", POINT, answer(1.0))[0]) == 1.0
     again = ResumableStore(tmp_path / "j", ["a"], resume=True)
-    found = again.get_or_compute("rows", POINT, lambda: pytest.fail("was known"))
-    assert float(found[0]) == 1.0
-    assert found[1] is None
+    result = again.get_or_compute("rows", POINT, lambda: pytest.fail("was known"))
+    assert float(result[0]) == 1.0
+    assert result[1] is None
     assert again.reused_count == 1
     assert float(again.get_or_compute("other rows", POINT, answer(2.0))[0]) == 2.0
     assert float(again.get_or_compute("rows", POINT + 1e-16, lambda: pytest.fail("the same number"))[0]) == 1.0
-    assert float(again.get_or_compute("rows", POINT + 1e-15, answer(3.0))[0]) == 3.0  # the next number is another question
+    assert (
+        float(again.get_or_compute("rows", POINT + 1e-15, answer(3.0))[0]) == 3.0
+    )  # the next number is another question
 
 
 @pytest.mark.parametrize("damage", ["cut", "junk", "empty"])
@@ -59,12 +61,14 @@ def test_another_problem_is_refused(tmp_path):
 
 def test_stopped_work_is_not_deleted_by_other_work(tmp_path):
     """A command into the same folder: hours may lie there."""
-    kept = ResumableStore(tmp_path / "j", ["a"], resume=None)
-    kept.get_or_compute("rows", POINT, answer(1.0))
+    stored = ResumableStore(tmp_path / "j", ["a"], resume=None)
+    stored.get_or_compute("rows", POINT, answer(1.0))
     for problem, said in ((["a"], "the same work"), (["b"], "other work")):
         with pytest.raises(InvalidInput, match=f"{said}, stopped; .*delete"):
             ResumableStore(tmp_path / "j", problem, resume=None)
-    assert float(ResumableStore(tmp_path / "j", ["a"], resume=True).get_or_compute("rows", POINT, answer(2.0))[0]) == 1.0
+    assert (
+        float(ResumableStore(tmp_path / "j", ["a"], resume=True).get_or_compute("rows", POINT, answer(2.0))[0]) == 1.0
+    )
 
 
 def test_another_program_answers_anew(tmp_path, monkeypatch):
@@ -76,7 +80,9 @@ def test_another_program_answers_anew(tmp_path, monkeypatch):
 
 def test_without_resuming_nothing_is_found(tmp_path):
     ResumableStore(tmp_path / "j", ["a"], resume=False).get_or_compute("rows", POINT, answer(1.0))
-    assert float(ResumableStore(tmp_path / "j", ["a"], resume=False).get_or_compute("rows", POINT, answer(2.0))[0]) == 2.0
+    assert (
+        float(ResumableStore(tmp_path / "j", ["a"], resume=False).get_or_compute("rows", POINT, answer(2.0))[0]) == 2.0
+    )
 
 
 def test_other_files_are_not_removed(tmp_path):
@@ -91,15 +97,19 @@ def test_a_folder_that_was_begun_when_all_ended_is_begun_again(tmp_path, half):
     (tmp_path / "j").mkdir()
     if half == "stamp":
         (tmp_path / "j" / ".problem.0a1b").write_text("0")
-    assert float(ResumableStore(tmp_path / "j", ["a"], resume=None).get_or_compute("rows", POINT, answer(1.0))[0]) == 1.0
-    assert float(ResumableStore(tmp_path / "j", ["a"], resume=True).get_or_compute("rows", POINT, answer(2.0))[0]) == 1.0
+    assert (
+        float(ResumableStore(tmp_path / "j", ["a"], resume=None).get_or_compute("rows", POINT, answer(1.0))[0]) == 1.0
+    )
+    assert (
+        float(ResumableStore(tmp_path / "j", ["a"], resume=True).get_or_compute("rows", POINT, answer(2.0))[0]) == 1.0
+    )
     assert sorted(path.suffix for path in (tmp_path / "j").iterdir()) in (["", ".pt"], ["", "", ".pt"])
 
 
 def test_a_folder_whose_removal_was_interrupted_is_a_journal_still(tmp_path, monkeypatch):
-    kept = ResumableStore(tmp_path / "j", ["a"], resume=False)
+    stored = ResumableStore(tmp_path / "j", ["a"], resume=False)
     for number in range(3):
-        kept.get_or_compute("rows", POINT + number, answer(1.0))
+        stored.get_or_compute("rows", POINT + number, answer(1.0))
     unlink, removed = Path.unlink, []
 
     def interrupted(path, **options):
@@ -118,13 +128,15 @@ def test_a_folder_whose_removal_was_interrupted_is_a_journal_still(tmp_path, mon
 
 
 def test_an_interrupt_while_writing_leaves_no_answer(tmp_path, monkeypatch):
-    kept = ResumableStore(tmp_path / "j", ["a"], resume=False)
-    kept.get_or_compute("other rows", POINT, answer(0.0))
+    stored = ResumableStore(tmp_path / "j", ["a"], resume=False)
+    stored.get_or_compute("other rows", POINT, answer(0.0))
     monkeypatch.setattr(os, "replace", lambda a, b: (_ for _ in ()).throw(KeyboardInterrupt))
     with pytest.raises(KeyboardInterrupt):
-        kept.get_or_compute("rows", POINT, answer(1.0))
+        stored.get_or_compute("rows", POINT, answer(1.0))
     monkeypatch.undo()
-    assert float(ResumableStore(tmp_path / "j", ["a"], resume=True).get_or_compute("rows", POINT, answer(2.0))[0]) == 2.0
+    assert (
+        float(ResumableStore(tmp_path / "j", ["a"], resume=True).get_or_compute("rows", POINT, answer(2.0))[0]) == 2.0
+    )
 
 
 def test_fingerprints_tell_apart_what_is_joined():
@@ -167,7 +179,9 @@ def test_another_engine_is_another_problem(recording):
     """Its last digits differ, and a fit goes on bit by bit."""
     cloth, ids = twins.at(recording), []
     for cloth.engine in ("fused", "reference"):
-        objective = Objective(cloth, collect_unknowns(cloth, ["youngs_modulus"], None), [build_episode(cloth, recording)])
+        objective = Objective(
+            cloth, collect_unknowns(cloth, ["youngs_modulus"], None), [build_episode(cloth, recording)]
+        )
         ids.append(digest(objective.fingerprint_parts()))
     assert ids[0] != ids[1]
 
@@ -177,8 +191,8 @@ def test_beginnings_of_several_episodes_are_told_apart(recording, tmp_path):
     both = [twins.first(twins.twin(seed=3), 4), recording]
     names = ["youngs_modulus", "air.normal"]
     plain = identify(twins.at(both[0]), both, names, iterations=1)
-    kept = identify(twins.at(both[0]), both, names, iterations=1, journal=tmp_path / "journal")
-    assert kept.parameters["youngs_modulus"].value == plain.parameters["youngs_modulus"].value
+    stored = identify(twins.at(both[0]), both, names, iterations=1, journal=tmp_path / "journal")
+    assert stored.parameters["youngs_modulus"].value == plain.parameters["youngs_modulus"].value
 
 
 def test_all_code_that_answers_is_in_the_fingerprint(tmp_path, monkeypatch):

@@ -7,7 +7,7 @@ import torch
 from helpers import least_squares
 
 from torchcloth.identification.estimators import levenberg_marquardt, linearity, statistical_linearisation
-from torchcloth.identification.residuals.blocks import BLOCKS
+from torchcloth.identification.residuals.blocks import RESIDUAL_BLOCKS
 from torchcloth.identification.uncertainty.identifiability import ParameterInfluence
 
 ONE = torch.ones(3, dtype=torch.float64)
@@ -24,7 +24,7 @@ def problem():
     objective = SimpleNamespace(
         problem=lambda: solver,
         unknowns=[SimpleNamespace(name=name) for name in "abc"],
-        blocks=BLOCKS[:1],
+        blocks=RESIDUAL_BLOCKS[:1],
         cloth=SimpleNamespace(mesh=SimpleNamespace(extent=1e9)),
         linearise_by_differences=lambda raw, steps: (linear, ParameterInfluence(ONE, ONE)),
     )

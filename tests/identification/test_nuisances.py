@@ -32,7 +32,9 @@ def near(recording):
 def objective(pulled):
     model = stretched_sheets.model(pulled)
     seen = build_episode(model, pulled).first_fraction(0.3)
-    return Objective(model, collect_unknowns(model, ["youngs_modulus"], None), [seen, seen], 4e-4, select_nuisances(EVERY, ["rim"]))
+    return Objective(
+        model, collect_unknowns(model, ["youngs_modulus"], None), [seen, seen], 4e-4, select_nuisances(EVERY, ["rim"])
+    )
 
 
 def test_every_unknown_has_its_slope(objective):
@@ -56,16 +58,18 @@ def test_every_unknown_has_its_slope(objective):
 def test_a_first_shape_that_was_not_measured_does_not_settle(pulled):
     """Slopes along where the grippers hold, of cloth that moves from the first frame on."""
     model = stretched_sheets.model(pulled)
-    seen = replace(build_episode(model, pulled).first_fraction(0.3), settles=False)
-    found = Objective(model, collect_unknowns(model, ["youngs_modulus"], None), [seen], 4e-4, select_nuisances(["grasp"]))
-    still = simulate(model, found.unknowns, found.start[:1], seen, 4e-4)
-    torch.testing.assert_close(found.observe(found.start)[0].x, still.x)
+    seen = replace(build_episode(model, pulled).first_fraction(0.3), needs_settling=False)
+    result = Objective(
+        model, collect_unknowns(model, ["youngs_modulus"], None), [seen], 4e-4, select_nuisances(["grasp"])
+    )
+    still = simulate(model, result.unknowns, result.start[:1], seen, 4e-4)
+    torch.testing.assert_close(result.observe(result.start)[0].x, still.x)
 
 
 def test_what_a_late_clock_sees_moves_as_fast_as_it_is_seen_to(pulled):
     model = stretched_sheets.model(pulled)
-    seen, own = build_episode(model, pulled).first_fraction(0.3), collect_unknowns(model, ["youngs_modulus"], None)
-    frames, clock, h = simulate(model, own, torch.tensor([own[0].start]), seen), NUISANCE_KINDS["clock"](), 1e-6
+    seen, of_part = build_episode(model, pulled).first_fraction(0.3), collect_unknowns(model, ["youngs_modulus"], None)
+    frames, clock, h = simulate(model, of_part, torch.tensor([of_part[0].start]), seen), NUISANCE_KINDS["clock"](), 1e-6
     one, two = (clock.observe(frames, torch.tensor([0.004 + d]), seen) for d in (-h, h))
     torch.testing.assert_close((two.x - one.x)[:-1] / (2 * h), 0.5 * (one.v + two.v)[:-1], rtol=1e-5, atol=1e-6)
 
@@ -80,10 +84,10 @@ def test_an_episodes_nuisances_do_not_touch_the_other(objective):
 def test_a_late_clock_is_found(pulled):
     late = stretched_sheets.record(setting=stretched_sheets.Setting(clock=0.02))
     fit = identify(near(late), late, ["youngs_modulus"], nuisances={"clock": 0.05}, iterations=4)
-    (own,) = fit.nuisances.values()
-    assert abs(own["clock"].value - 0.02) < 4 * own["clock"].std
-    assert own["clock"].value == pytest.approx(0.02, abs=3e-3)
-    assert own["clock"].unit == "s"
+    (of_part,) = fit.nuisances.values()
+    assert abs(of_part["clock"].value - 0.02) < 4 * of_part["clock"].std
+    assert of_part["clock"].value == pytest.approx(0.02, abs=3e-3)
+    assert of_part["clock"].unit == "s"
     assert "clock" not in fit.parameters
 
 
@@ -107,13 +111,13 @@ def test_a_late_clock_sees_what_comes_after_the_last_frame(pulled):
     assert float(longer.times[-1]) == pytest.approx(float(seen.times[-1]) + 0.09)
     assert [len(longer.clouds[t]) for t in range(len(seen.times), len(longer.times))] == [0, 0]
     assert not bool(longer.markers[len(seen.times) :].isfinite().any())
-    own = collect_unknowns(model, ["youngs_modulus"], None)
-    raw = torch.tensor([own[0].start])
-    truth = simulate(model, own, raw, replace(seen, times=torch.cat([seen.times, seen.times[-1:] + late]))).x[-1]
+    of_part = collect_unknowns(model, ["youngs_modulus"], None)
+    raw = torch.tensor([of_part[0].start])
+    truth = simulate(model, of_part, raw, replace(seen, times=torch.cat([seen.times, seen.times[-1:] + late]))).x[-1]
     clock = NUISANCE_KINDS["clock"]()
     errors = []
     for given in (longer, seen):
-        frames = clock.observe(simulate(model, own, raw, given), torch.tensor([late]), given)
+        frames = clock.observe(simulate(model, of_part, raw, given), torch.tensor([late]), given)
         errors.append((frames.x[len(seen.times) - 1] - truth).norm(dim=-1).max().item())
     assert errors[0] < 0.1 * errors[1]
 
@@ -127,15 +131,15 @@ def test_a_shifted_camera_is_found_and_the_fabric_stays(pulled):
         markers=replace(markers, xyz=markers.xyz + shift),
     )
     fit = identify(near(moved), moved, ["youngs_modulus"], nuisances={"camera": 0.01}, iterations=4)
-    (own,) = fit.nuisances.values()
+    (of_part,) = fit.nuisances.values()
     for axis, value in zip("xyz", shift, strict=True):
-        assert own[f"camera.{axis}"].value == pytest.approx(value, abs=1e-3)
+        assert of_part[f"camera.{axis}"].value == pytest.approx(value, abs=1e-3)
     assert fit.parameters["membrane_stiffness"].value == pytest.approx(60.0, rel=0.05)
 
 
 def test_names_and_deviations():
-    found = select_nuisances({"clock": 0.4, "camera": None}, implied=["rim"])
-    assert [(n.name, n.std) for n in found] == [("clock", 0.4), ("camera", 0.002), ("rim", 0.002)]
+    result = select_nuisances({"clock": 0.4, "camera": None}, implied=["rim"])
+    assert [(n.name, n.std) for n in result] == [("clock", 0.4), ("camera", 0.002), ("rim", 0.002)]
     assert select_nuisances({"rim": 0}, implied=["rim"]) == []
     assert select_nuisances(()) == []
     with pytest.raises(InvalidInput, match=r"nuisance; got 'clok'; expected one of clock, camera"):

@@ -5,7 +5,7 @@ from typing import Any
 
 import torch
 
-from torchcloth.identification.pictures import _felt, plot_parameters, save_figure
+from torchcloth.identification.pictures import _force_readings, plot_parameters, save_figure
 
 
 def estimate(value, initial, *ci95) -> Any:
@@ -35,5 +35,5 @@ def test_grippers_that_felt_no_force_are_not_drawn():
     both, torque = torch.rand(5, 6), torch.full((5, 6), torch.nan)
     torque[:, 3:] = 1.0
     e: Any = SimpleNamespace(wrenches={"left": both, "right": torque})
-    assert list(_felt(e)) == ["left"]
-    assert torch.equal(_felt(e)["left"], both[1:, :3])
+    assert list(_force_readings(e)) == ["left"]
+    assert torch.equal(_force_readings(e)["left"], both[1:, :3])

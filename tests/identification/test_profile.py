@@ -12,10 +12,9 @@ from helpers.least_squares import solve
 from torchcloth.errors import InvalidInput
 from torchcloth.identification import identify
 from torchcloth.identification.estimators import levenberg_marquardt
-from torchcloth.identification.uncertainty.estimates import Estimate
-from torchcloth.identification.uncertainty.profile_likelihood import compute_profiles
 from torchcloth.identification.fit_warnings import warn_of_skew
-from torchcloth.identification.uncertainty.estimates import EstimateSet
+from torchcloth.identification.uncertainty.estimates import Estimate, EstimateSet
+from torchcloth.identification.uncertainty.profile_likelihood import compute_profiles
 
 BEND = 1.0
 
@@ -39,13 +38,13 @@ def profiled(given, clip=lambda raw: raw, names="abc"):
 
 def test_profiles_of_a_linear_problem_are_the_quadratic_intervals():
     """Up to residuals that cross the Huber bound on the way."""
-    _, covariance, found = profiled(toy())
+    _, covariance, result = profiled(toy())
     for k, name in enumerate("abc"):
-        low, high = found[name].ci95
+        low, high = result[name].ci95
         half = 1.96 * float(covariance[k, k].sqrt())
         assert (high - low) / 2 == pytest.approx(half, rel=0.05)
-        assert found[name].skew == pytest.approx(1.0, abs=0.05)
-        assert found[name].cost_rise[len(found[name].cost_rise) // 2] == 0.0
+        assert result[name].skew == pytest.approx(1.0, abs=0.05)
+        assert result[name].cost_rise[len(result[name].cost_rise) // 2] == 0.0
 
 
 def test_profiles_do_not_depend_on_how_a_parameter_is_written():
@@ -64,23 +63,23 @@ def test_an_interval_is_open_where_the_cost_does_not_rise():
     """One unknown saturates: from some value on, more of it changes nothing."""
     saturating = lambda raw: torch.cat([1 - torch.exp(-raw[:1]), raw[1:]])  # noqa: E731
     given = toy(saturating, loud=30.0)
-    _, _, found = profiled(given)
-    low, high = found["a"].ci95
+    _, _, result = profiled(given)
+    low, high = result["a"].ci95
     assert high is None
     assert low is not None
-    assert found["a"].skew is None
-    assert max(found["a"].cost_rise[-2:]) < 1.92
-    assert None not in found["b"].ci95
+    assert result["a"].skew is None
+    assert max(result["a"].cost_rise[-2:]) < 1.92
+    assert None not in result["b"].ci95
 
 
 def test_an_interval_ends_where_the_domain_does():
     """A legal range that begins within a standard error of the optimum."""
     final, covariance, _ = profiled(toy(), names="")
     bound = float(final.raw[0] - 0.7 * covariance[0, 0].sqrt())
-    _, _, found = profiled(toy(), clip=lambda raw: max(raw, bound), names="a")
-    assert found["a"].ci95[0] == bound
-    assert found["a"].ci95[1] is not None
-    assert found["a"].cost_rise[0] == pytest.approx(0.5 * 0.7**2, rel=0.1)
+    _, _, result = profiled(toy(), clip=lambda raw: max(raw, bound), names="a")
+    assert result["a"].ci95[0] == bound
+    assert result["a"].ci95[1] is not None
+    assert result["a"].cost_rise[0] == pytest.approx(0.5 * 0.7**2, rel=0.1)
 
 
 def test_a_profile_replaces_the_interval_and_can_be_resumed(model, brief, tmp_path):
@@ -119,7 +118,7 @@ def test_a_profile_of_what_is_not_fitted_is_refused(model, brief):
 
 def test_a_profile_is_offered_where_slopes_change():
     known = Estimate(2.0, 0.1, (1.8, 2.2), "-", 1.0, True)
-    lost = Estimate(2.0, 1.9, (0.1, 9.0), "-", 1.0, False)
-    found = EstimateSet({"a": known, "b": lost}, {})
-    assert warn_of_skew(found, ["b"]) == []
-    assert warn_of_skew(found, ["a", "b"])[0].endswith("profile (--profile a) shows it")
+    missing = Estimate(2.0, 1.9, (0.1, 9.0), "-", 1.0, False)
+    result = EstimateSet({"a": known, "b": missing}, {})
+    assert warn_of_skew(result, ["b"]) == []
+    assert warn_of_skew(result, ["a", "b"])[0].endswith("profile (--profile a) shows it")

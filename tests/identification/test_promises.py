@@ -57,13 +57,13 @@ def test_what_tells_contraction_to_five_per_cent(points, frames, rate, markers):
 def test_the_start_does_not_matter_over_two_decades():
     """Ten starts of E, full fits: nine or more within a standard error of their median."""
     recording = stretched_sheets.record(seed=5)
-    found = []
+    result = []
     for share in torch.linspace(-1, 1, 10).tolist():
         model = stretched_sheets.model(recording, youngs_modulus=6e4 * 10**share)
-        found.append(identify(model, recording, PAIR, nuisances=GRASP).parameters["youngs_modulus"])
-        print(f"from {6e4 * 10**share:.3g} Pa: {found[-1].value:.5g} +- {found[-1].std:.2g}", flush=True)
-    values = torch.tensor([e.value for e in found])
-    assert int(((values - values.median()).abs() < min(e.std for e in found)).sum()) >= 9
+        result.append(identify(model, recording, PAIR, nuisances=GRASP).parameters["youngs_modulus"])
+        print(f"from {6e4 * 10**share:.3g} Pa: {result[-1].value:.5g} +- {result[-1].std:.2g}", flush=True)
+    values = torch.tensor([e.value for e in result])
+    assert int(((values - values.median()).abs() < min(e.std for e in result)).sum()) >= 9
 
 
 def test_step_and_mesh_do_not_matter(pulled):
@@ -73,7 +73,11 @@ def test_step_and_mesh_do_not_matter(pulled):
     finer = tuple(round(1.5 * (n - 1)) + 1 for n in stretched_sheets.FIT)
     other = stretched_sheets.remeshed(pulled, finer)
     cases = {
-        "half the step": (stretched_sheets.model(pulled), pulled, {"dt": 0.5 * stretched_sheets.model(pulled).stable_step()}),
+        "half the step": (
+            stretched_sheets.model(pulled),
+            pulled,
+            {"dt": 0.5 * stretched_sheets.model(pulled).stable_step()},
+        ),
         "finer mesh": (stretched_sheets.model(other, finer), other, {}),
     }
     for label, (model, recording, options) in cases.items():
@@ -88,7 +92,9 @@ def test_step_and_mesh_do_not_matter(pulled):
 def test_what_a_fit_costs():
     """1 s, 800 triangles, 30 frames, four parameters: ten iterations, 90 s; beside plain gradient descent."""
     size = (26, 17)
-    recording = stretched_sheets.remeshed(stretched_sheets.record(seed=5, setting=stretched_sheets.Setting(frames=30, rate=29.0)), size)
+    recording = stretched_sheets.remeshed(
+        stretched_sheets.record(seed=5, setting=stretched_sheets.Setting(frames=30, rate=29.0)), size
+    )
     names = [*PAIR, "bending.stiffness", "air.normal"]
     rows = {}
     for method, iterations in (("gauss-newton", 35), ("gradient-descent", 10)):
@@ -129,8 +135,8 @@ def test_error_bars_cover(tmp_path):
     """44 twins, as fitted and corrected for the mesh: 95 % intervals of identifiable parameters hold the truth in 88 to
     100 %, and errors have unit spread."""
     for refine in (False, True):
-        found = error_bar_coverage.table(error_bar_coverage.run(tmp_path / f"twins{refine}.jsonl", 44, refine=refine))
-        for name, row in found.items():
+        result = error_bar_coverage.table(error_bar_coverage.run(tmp_path / f"twins{refine}.jsonl", 44, refine=refine))
+        for name, row in result.items():
             print(name, row)
             assert 0.88 <= row["covered"] <= 1.0, name
             assert 0.7 < row["spread"] < 1.3, name

@@ -10,7 +10,13 @@ from helpers import least_squares
 
 from torchcloth import recordings as rec
 from torchcloth.identification.estimators import levenberg_marquardt
-from torchcloth.identification.estimators.levenberg_marquardt import DEFAULT_NOISE_MODEL, inflate_covariance, covariance, minimise, student_quantile
+from torchcloth.identification.estimators.levenberg_marquardt import (
+    DEFAULT_NOISE_MODEL,
+    covariance,
+    inflate_covariance,
+    minimise,
+    student_quantile,
+)
 from torchcloth.identification.estimators.linearity import LinearityCheck
 from torchcloth.identification.uncertainty import replicates
 from torchcloth.identification.uncertainty.consider_covariance import solution_covariance
@@ -28,12 +34,14 @@ def repeats(seed, count, motions=1, hidden=HIDDEN, offset=0.0):
     generator = torch.Generator().manual_seed(seed)
     jacobian, data, frame, patch, episode = [], [], [], [], []
     for motion in range(motions):
-        own = least_squares.sensitivities(generator, FRAMES)
+        of_part = least_squares.sensitivities(generator, FRAMES)
         for _ in range(count):
-            value = least_squares.TRUE + hidden * torch.randn(3, generator=generator, dtype=torch.float64) + offset * motion
+            value = (
+                least_squares.TRUE + hidden * torch.randn(3, generator=generator, dtype=torch.float64) + offset * motion
+            )
             number, (t, where) = len(jacobian), least_squares.layout(FRAMES)
-            jacobian.append(own)
-            data.append(own @ value + 0.1 * least_squares.noise(generator, 0.0, FRAMES))
+            jacobian.append(of_part)
+            data.append(of_part @ value + 0.1 * least_squares.noise(generator, 0.0, FRAMES))
             frame.append(t + number * (FRAMES + DEFAULT_NOISE_MODEL.frames_per_time_block + 1))
             patch.append(where)
             episode.append(torch.full_like(t, number))
@@ -42,7 +50,7 @@ def repeats(seed, count, motions=1, hidden=HIDDEN, offset=0.0):
     return toy, torch.cat(episode)
 
 
-def found(seed, count, motions=1, strata=None, scatter=True, **options):
+def result(seed, count, motions=1, strata=None, scatter=True, **options):
     toy, episode = repeats(seed, count, motions, **options)
     at = minimise(toy.problem(), least_squares.TRUE.clone(), 20, lambda _: False)
     matrix = covariance(toy.problem(), at)
@@ -57,16 +65,16 @@ def test_intervals_cover_what_differs_between_episodes(count):
     """95 % of 300; without the scatter far fewer, because within an episode all frames agree on a wrong value."""
     covered, blind = [], []
     for seed in range(100):
-        for scatter, kept in ((True, covered), (False, blind)):
-            error, std = found(seed, count, scatter=scatter)
-            kept.append((error.abs() < 1.96 * std).double())
+        for scatter, stored in ((True, covered), (False, blind)):
+            error, std = result(seed, count, scatter=scatter)
+            stored.append((error.abs() < 1.96 * std).double())
     assert 0.90 <= float(torch.stack(covered).mean()) <= 0.995
     assert float(torch.stack(blind).mean()) < 0.75
 
 
 def test_errors_are_those_of_a_mean_of_episodes():
     """Root mean square over seeds: what differs over sqrt n, widened as Student's t for so few."""
-    stds = torch.stack([found(seed, 6)[1] for seed in range(60)])
+    stds = torch.stack([result(seed, 6)[1] for seed in range(60)])
     wanted = HIDDEN / 6**0.5 * scipy.stats.t.ppf(0.975, 5) / 1.96
     assert float(stds.square().mean().sqrt()) == pytest.approx(wanted, rel=0.12)
 
@@ -76,11 +84,13 @@ def test_leaving_out_an_episode_moves_the_estimate_as_a_fit_shift_without_it_doe
     toy, episode = repeats(1, 3, hidden=0.5)
     whole = minimise(toy.problem(), least_squares.TRUE.clone(), 20, lambda _: False)
     for e in range(3):
-        kept = episode != e
-        J = torch.func.jacfwd(toy.model)(least_squares.TRUE)[kept]
-        alone = least_squares.Toy(lambda raw, J=J: J @ raw, toy.data[kept], toy.frame[kept], toy.patch[kept], prior_std=1e3)
+        stored = episode != e
+        J = torch.func.jacfwd(toy.model)(least_squares.TRUE)[stored]
+        alone = least_squares.Toy(
+            lambda raw, J=J: J @ raw, toy.data[stored], toy.frame[stored], toy.patch[stored], prior_std=1e3
+        )
         wanted = minimise(alone.problem(), least_squares.TRUE.clone(), 20, lambda _: False).raw - whole.raw
-        moved = replicates._shift_without(toy.problem(), whole, ~kept)
+        moved = replicates._shift_without(toy.problem(), whole, ~stored)
         assert float((moved - wanted).norm()) < 0.1 * float(wanted.norm())
 
 
@@ -89,14 +99,16 @@ def test_episodes_shift_without_data_of_a_kind_do_not_scatter():
     toy, episode = repeats(1, 3)
     at = minimise(toy.problem(), least_squares.TRUE.clone(), 20, lambda _: False)
     alone = torch.zeros_like(episode)
-    assert torch.equal(replicates.jackknife_variance(toy.problem(), at, alone, torch.zeros(3).long()), torch.zeros_like(at.raw))
+    assert torch.equal(
+        replicates.jackknife_variance(toy.problem(), at, alone, torch.zeros(3).long()), torch.zeros_like(at.raw)
+    )
 
 
 def test_only_replicates_scatter():
     """Two motions whose values differ by far more than replicates of one: that difference is not scatter."""
     strata, options = torch.tensor([1, 1, 1, 2, 2, 2]), {"motions": 2, "offset": 0.5}
     within, mixed, none = (
-        torch.stack([found(seed, 3, **options, **how)[1] for seed in range(10)]).mean(0)
+        torch.stack([result(seed, 3, **options, **how)[1] for seed in range(10)]).mean(0)
         for how in ({"strata": strata}, {}, {"scatter": False})
     )
     assert bool((within < 1.2 * none).all())
@@ -148,7 +160,7 @@ def test_nuisances_of_an_episode_do_not_scatter():
     torch.manual_seed(0)
     episodes, frames, points, sigma = 4, 12, 16, 1e-4
     offsets = 5e-3 * torch.ones(episodes)
-    slopes, frame, patch, own = [], [], [], []
+    slopes, frame, patch, of_part = [], [], [], []
     for e in range(episodes):
         jacobian = torch.zeros(frames, points, 1 + episodes)
         jacobian[..., 0] = -0.01 * torch.rand(frames, points)
@@ -157,8 +169,8 @@ def test_nuisances_of_an_episode_do_not_scatter():
         t, where = torch.meshgrid(torch.arange(frames), torch.arange(points), indexing="ij")
         frame.append(t.reshape(-1) + e * (frames + DEFAULT_NOISE_MODEL.frames_per_time_block))
         patch.append(where.reshape(-1))
-        own.append(torch.full((frames * points,), e))
-    J, frame, patch, own = map(torch.cat, (slopes, frame, patch, own))
+        of_part.append(torch.full((frames * points,), e))
+    J, frame, patch, of_part = map(torch.cat, (slopes, frame, patch, of_part))
     data = -J @ torch.cat([torch.ones(1), offsets]) + sigma * torch.randn(len(J))
 
     def value(raw):
@@ -177,13 +189,13 @@ def test_nuisances_of_an_episode_do_not_scatter():
     objective = SimpleNamespace(
         problem=lambda: problem,
         episodes=[SimpleNamespace(needs_settling=False)] * episodes,
-        episode_of_rows=lambda linear: own,
+        episode_of_rows=lambda linear: of_part,
         unknowns=[None],
         start=torch.zeros(1 + episodes),
         nuisances=[],
         cloth=SimpleNamespace(boundaries={}),
     )
-    found = solution_covariance(objective, LinearityCheck(at, None, [], [])).diagonal().sqrt()
+    result = solution_covariance(objective, LinearityCheck(at, None, [], [])).diagonal().sqrt()
     alone = covariance(problem, at).diagonal().sqrt()
-    assert found[1:] == pytest.approx(alone[1:])
-    assert float(found[0]) > float(alone[0])
+    assert result[1:] == pytest.approx(alone[1:])
+    assert float(result[0]) > float(alone[0])

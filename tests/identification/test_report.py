@@ -10,15 +10,15 @@ from helpers.twins import at
 
 import torchcloth as tc
 from torchcloth.episodes.observed import Episode
-from torchcloth.episodes.unknowns import collect_unknowns, apply_priors
+from torchcloth.episodes.unknowns import apply_priors, collect_unknowns
 from torchcloth.identification.estimators import levenberg_marquardt, linearity
+from torchcloth.identification.fit_warnings import fit_warnings
 from torchcloth.identification.nuisances import NuisanceSlice
 from torchcloth.identification.residuals.metrics import DistanceMetrics
-from torchcloth.identification.residuals.rigid_carry import CARRIED
+from torchcloth.identification.residuals.rigid_carry import CARRIED_NULL
 from torchcloth.identification.result import Identification
-from torchcloth.identification.uncertainty.estimates import Estimate
-from torchcloth.identification.fit_warnings import fit_warnings
 from torchcloth.identification.uncertainty.estimates import (
+    Estimate,
     EstimateSet,
     make_estimates,
     make_nuisance_estimates,
@@ -31,7 +31,7 @@ FIT = {"chamfer_before": 5e-3, "chamfer_after": 0.8e-3, "chamfer_null": 10e-3, "
 EPISODE = Episode("shake", {}, torch.zeros(9), [], torch.zeros(0, 3), needs_settling=True, noise_std=1e-3)
 
 
-def found(a=GOOD, b=GOOD, correlation=0.0, density=True):
+def answer(a=GOOD, b=GOOD, correlation=0.0, density=True):
     parameters = {"a": a, "b": b}
     if density:
         parameters["areal_density"] = Estimate(0.3, 0.005, (0.29, 0.31), "kg/m^2", 0.3, True, "prior")
@@ -44,7 +44,7 @@ def warn(model, what=None, fit=None, episodes=(EPISODE,), frames=None, null=""):
     flat = torch.as_tensor(model.mesh.vertices).expand(2, -1, -1)
     faces = torch.as_tensor(model.mesh.faces)
     frames = [flat] if frames is None else frames
-    return fit_warnings(model, episodes, what or found(), {**FIT, **(fit or {})}, frames, faces, null)
+    return fit_warnings(model, episodes, what or answer(), {**FIT, **(fit or {})}, frames, faces, null)
 
 
 def folded(model):
@@ -63,11 +63,11 @@ def test_a_good_fit_has_no_warnings(model):
 @pytest.mark.parametrize(
     ("change", "said"),
     [
-        ({"null": CARRIED}, "no better than cloth carried rigidly"),
+        ({"null": CARRIED_NULL}, "no better than cloth carried rigidly"),
         ({"fit": {"chamfer_before": 0.7e-3}}, "farther from the points than the start"),
-        ({"what": found(a=LOST)}, "a is not identifiable from these data"),
-        ({"what": found(correlation=-0.97)}, "b and a are confounded (correlation -0.97)"),
-        ({"what": found(density=False)}, "areal density was taken as exact"),
+        ({"what": answer(a=LOST)}, "a is not identifiable from these data"),
+        ({"what": answer(correlation=-0.97)}, "b and a are confounded (correlation -0.97)"),
+        ({"what": answer(density=False)}, "areal density was taken as exact"),
         ({"fit": {"rms_after": 2.1e-3}}, "the residual (2.1 mm rms) exceeds 1.3 times the sensor noise (1.0 mm)"),
         ({"episodes": (EPISODE, replace(EPISODE, needs_settling=False))}, "an episode has no initial_vertices"),
         ({"episodes": (replace(EPISODE, frames_after_motion=3),)}, "shake: 3 of 12 frames come after the motion's end"),
@@ -91,7 +91,7 @@ def test_unknown_noise_is_not_compared(model):
 
 def test_what_was_measured_or_absent_is_not_called_unidentifiable(model):
     absent = Estimate(1.0, 9.0, (0.1, 9.0), "-", 1.0, False, "not in the model")
-    assert warn(model, found(a=absent)) == []
+    assert warn(model, answer(a=absent)) == []
 
 
 def test_an_unstable_motion_is_said_and_differences_replace_tangents():
@@ -116,8 +116,10 @@ def test_an_unstable_motion_is_said_and_differences_replace_tangents():
             return linear(self.secant), None
 
     def at_slope(slope):
-        size, own = torch.tensor([1e-3]), torch.ones(1)
-        return levenberg_marquardt.Iterate(torch.zeros(1), linear(slope), True, size, own, torch.tensor([torch.inf]))
+        size, of_part = torch.tensor([1e-3]), torch.ones(1)
+        return levenberg_marquardt.Iterate(
+            torch.zeros(1), linear(slope), True, size, of_part, torch.tensor([torch.inf])
+        )
 
     def made(name, secant):
         cloth, blocks = SimpleNamespace(mesh=SimpleNamespace(extent=1.0)), [SimpleNamespace(unit="m")]
@@ -197,12 +199,12 @@ def test_nuisances_of_what_is_withdrawn_are_not_known_either():
     """Their tiny errors are those of slopes that mean nothing, as the parameters' are."""
     episode, clock = SimpleNamespace(name="swing"), NuisanceSlice(None, slice(0, 1), ["clock"], ["s"], [0.02])
     raw, covariance = torch.tensor([0.012]), torch.tensor([[3e-4**2]])
-    found = make_nuisance_estimates([episode], [[clock]], raw, covariance)["swing"]["clock"]
-    assert (found.identifiable, found.std) == (True, pytest.approx(3e-4))
-    found = make_nuisance_estimates([episode], [[clock]], raw, covariance, withdrawn=True)["swing"]["clock"]
-    assert not found.identifiable
-    assert found.std == pytest.approx(math.hypot(0.02, 0.012))
-    assert found.ci95 == pytest.approx((-0.0392, 0.0392), rel=1e-3)
+    answer = make_nuisance_estimates([episode], [[clock]], raw, covariance)["swing"]["clock"]
+    assert (answer.identifiable, answer.std) == (True, pytest.approx(3e-4))
+    answer = make_nuisance_estimates([episode], [[clock]], raw, covariance, withdrawn=True)["swing"]["clock"]
+    assert not answer.identifiable
+    assert answer.std == pytest.approx(math.hypot(0.02, 0.012))
+    assert answer.ci95 == pytest.approx((-0.0392, 0.0392), rel=1e-3)
 
 
 def test_what_is_withdrawn_far_from_its_start_is_uncertain_by_the_way(model):
@@ -210,7 +212,9 @@ def test_what_is_withdrawn_far_from_its_start_is_uncertain_by_the_way(model):
     unknowns = collect_unknowns(model, ["youngs_modulus"], None)
     for factor in (1e-3, 1e3):
         raw = torch.tensor([unknowns[0].start + math.log(factor)])
-        e = withdraw_estimates(make_estimates(model, unknowns, raw, torch.eye(1)), unknowns, raw).parameters["youngs_modulus"]
+        e = withdraw_estimates(make_estimates(model, unknowns, raw, torch.eye(1)), unknowns, raw).parameters[
+            "youngs_modulus"
+        ]
         assert e.std / e.value == pytest.approx(math.hypot(math.log(10), math.log(factor)))
 
 
@@ -219,9 +223,9 @@ def test_friction_is_judged_against_a_friction_s_size():
     table = {"table": tc.boundaries.Plane(friction=0.1)}
     cloth = tc.Cloth(mesh, tc.materials.AEP(1e5, 0.3), 0.2, {"gravity": tc.effects.Gravity()}, table, tc.Contact(0.05))
     unknowns = collect_unknowns(cloth, ["table.friction", "cone"], None)
-    found = make_estimates(cloth, unknowns, torch.tensor([0.05, 0.05]), torch.eye(2) * 0.2**2).parameters
-    assert not found["table.friction"].identifiable
-    assert not found["cone"].identifiable
+    answer = make_estimates(cloth, unknowns, torch.tensor([0.05, 0.05]), torch.eye(2) * 0.2**2).parameters
+    assert not answer["table.friction"].identifiable
+    assert not answer["cone"].identifiable
     known = make_estimates(cloth, unknowns, torch.tensor([0.05, 0.05]), torch.eye(2) * 0.05**2).parameters
     assert known["cone"].identifiable
 

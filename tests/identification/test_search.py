@@ -10,7 +10,7 @@ from helpers import least_squares, twins
 from helpers.least_squares import solve
 
 from torchcloth._utils.resume import ResumableStore
-from torchcloth.episodes.unknowns import collect_unknowns, apply_priors
+from torchcloth.episodes.unknowns import apply_priors, collect_unknowns
 from torchcloth.errors import InvalidInput
 from torchcloth.identification import build_episode, identify
 from torchcloth.identification.estimators import levenberg_marquardt, multistart
@@ -63,7 +63,12 @@ def test_a_distance_is_not_weighed_against_priors(model, brief, method, options,
 def test_descent_steps_by_each_unknowns_own_size(model, brief, adam):
     """A bowl with its bottom at twice the start: bending, of 1e-5 N m, gets as near as stiffness and drag do."""
     names = ["youngs_modulus", "air.normal", "bending.stiffness"]
-    objective = Objective(model, collect_unknowns(model, names, None), [build_episode(model, brief)], nuisances=select_nuisances([], ["rim"]))
+    objective = Objective(
+        model,
+        collect_unknowns(model, names, None),
+        [build_episode(model, brief)],
+        nuisances=select_nuisances([], ["rim"]),
+    )
     bottom = objective.start + 0.5 * objective.typical_changes
 
     def value_and_slope(question, raw, loss):
@@ -83,10 +88,10 @@ def test_a_search_that_was_stopped_ends_as_if_it_had_not_been(model, brief, tmp_
         pass
 
     def write(*args):
-        kept(*args)
+        stored(*args)
         raise Stop
 
-    kept = ResumableStore._write
+    stored = ResumableStore._write
     for method in ("gauss-newton", "lbfgs"):
         options = {"method": method, "iterations": 2, "guess": {"youngs_modulus": 5e4}}
         whole, folder, resumed, stops = identify(model, brief, PAIR, **options), tmp_path / method, None, 0
@@ -110,15 +115,15 @@ def test_a_search_that_was_stopped_ends_as_if_it_had_not_been(model, brief, tmp_
 def test_starts_are_spread_over_two_decades(model):
     unknowns = collect_unknowns(model, ["youngs_modulus", "poisson_ratio", "air.normal"], (0.3, 0.005))
     begin = torch.tensor([u.start for u in unknowns], dtype=torch.float64)
-    found = torch.stack(multistart.sample_starts(unknowns, begin, 33))
-    assert torch.equal(found[0], begin)
-    decades = (found[:, 0] - begin[0]) / 2.302585
+    result = torch.stack(multistart.sample_starts(unknowns, begin, 33))
+    assert torch.equal(result[0], begin)
+    decades = (result[:, 0] - begin[0]) / 2.302585
     assert float(decades.min()) < -0.9
     assert float(decades.max()) > 0.9
     counts = torch.histc(decades[1:], 4, -1, 1)
     assert float(counts.min()) >= 7  # evenly
-    assert float(found[:, 2].min()) >= 0.0  # amplitudes stay legal
-    assert torch.equal(found[:, 3], begin[3].expand(33))  # what was measured stays
+    assert float(result[:, 2].min()) >= 0.0  # amplitudes stay legal
+    assert torch.equal(result[:, 3], begin[3].expand(33))  # what was measured stays
 
 
 def test_starts_that_agree_are_counted():
@@ -155,9 +160,9 @@ def test_a_prior_of_ones_own(model, brief):
 
 def test_what_counts_as_large_does_not_depend_on_how_vague_a_prior_is(model):
     """An amplitude is judged against its typical size, and a wider prior is no knowledge."""
-    own = collect_unknowns(model, ["air.normal"], None)
-    (vague,), (narrow,) = (apply_priors(own, {"air.normal": (1.2, std)}) for std in (10.0, 0.5))
-    assert own[0].typical_amplitude == vague.typical_amplitude == narrow.typical_amplitude == pytest.approx(1.2)
+    of_part = collect_unknowns(model, ["air.normal"], None)
+    (vague,), (narrow,) = (apply_priors(of_part, {"air.normal": (1.2, std)}) for std in (10.0, 0.5))
+    assert of_part[0].typical_amplitude == vague.typical_amplitude == narrow.typical_amplitude == pytest.approx(1.2)
     assert (vague.prior_std, narrow.prior_std) == pytest.approx((10.0, 0.5))
 
 

@@ -112,7 +112,9 @@ def test_rows_keep_their_order_and_leave_the_first_frame_out(short):
     problem = Objective(model, unknowns, [seen])
     linear = problem.linearise(problem.start)
     value, patch = problem.evaluate(problem.start)
-    off = (value - linear.residual).abs()  # m: two kernels, last digits differ, and a point between two triangles may turn
+    off = (
+        value - linear.residual
+    ).abs()  # m: two kernels, last digits differ, and a point between two triangles may turn
     assert float(off.max()) < 1e-4
     assert float((off < 1e-9).double().mean()) > 0.98
     assert float((patch == linear.error_group).double().mean()) > 0.98

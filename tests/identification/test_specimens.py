@@ -99,15 +99,15 @@ def test_slopes(specimen, readings, name):
         return read.force.sum() + 100 * read.lateral_strain.sum()
 
     exact = torch.autograd.grad(total(), raw)[0].item()
-    found = []
+    result = []
     for step in (1e-3, 1e-4, 1e-5, 1e-6):
         with torch.no_grad():
             raw += step
             above = total().item()
             raw -= 2 * step
-            found.append((above - total().item()) / (2 * step))
+            result.append((above - total().item()) / (2 * step))
             raw += step
-    assert min(abs(f - exact) for f in found) < 1e-6 * abs(total().item())
+    assert min(abs(f - exact) for f in result) < 1e-6 * abs(total().item())
 
 
 def test_trellis_in_closed_form():

@@ -23,19 +23,19 @@ def isotropic(E: float, nu: float) -> tc.Cloth:
 
 def test_three_moduli_from_three_directions():
     """Within 3 standard errors; these as for a slope through 0 with white noise: 0.02 / sqrt(40 / 3), or 0.55 %."""
-    found = []
+    result = []
     for seed in range(3):
         draw = np.random.default_rng(seed)
-        found.append(fit_tension(cloth(), [readings(a, 0.02, draw) for a in (0, 45, 90)], NAMES))
+        result.append(fit_tension(cloth(), [readings(a, 0.02, draw) for a in (0, 45, 90)], NAMES))
     for name, truth in TRUTH.items():
-        values = np.array([f.parameters[name].value for f in found])
-        errors = np.array([f.parameters[name].std for f in found])
+        values = np.array([f.parameters[name].value for f in result])
+        errors = np.array([f.parameters[name].std for f in result])
         assert np.abs((values - truth) / errors).max() < 3.5, name
         if name != "shear_modulus":  # the 45 degrees hang on all three
             assert np.median(errors) == pytest.approx(0.0055 * truth, rel=0.4), name
-        assert all(f.parameters[name].identifiable for f in found)
-    assert max(f.errors[k]["force_rms_after"] for f in found for k in (0, 1, 2)) < 0.03
-    assert min(f.errors[k]["force_rms_before"] for f in found for k in (0, 1, 2)) > 0.1
+        assert all(f.parameters[name].identifiable for f in result)
+    assert max(f.errors[k]["force_rms_after"] for f in result for k in (0, 1, 2)) < 0.03
+    assert min(f.errors[k]["force_rms_before"] for f in result for k in (0, 1, 2)) > 0.1
 
 
 def test_what_the_data_do_not_see_is_not_identified():
@@ -132,8 +132,8 @@ def test_errors_do_not_hang_on_how_densely_a_curve_was_read():
         table = readings(0, 0.0, np.random.default_rng(0), count)
         along = table.displacement / table.displacement.max()
         bent = table.force + 0.01 * table.force.max() * np.sin(9 * along)
-        found = fit_tension(cloth(), replace(table, force=bent), ["youngs_modulus"])
-        stds.append(found.parameters["youngs_modulus"].std)
+        result = fit_tension(cloth(), replace(table, force=bent), ["youngs_modulus"])
+        stds.append(result.parameters["youngs_modulus"].std)
     assert stds[1] == pytest.approx(stds[0], rel=0.2)
 
 
@@ -154,8 +154,8 @@ def test_what_specimens_differ_by_widens_the_error():
         draw = np.random.default_rng(seed)
         tables = [readings(0, 0.005, draw) for _ in range(6)]
         tables = [replace(t, force=t.force * (1 + 0.05 * draw.normal())) for t in tables]
-        found = fit_tension(cloth(), tables, ["youngs_modulus"]).parameters["youngs_modulus"]
-        z.append((found.value - WARP) / found.std)
-        stated.append(found.std / WARP)
+        result = fit_tension(cloth(), tables, ["youngs_modulus"]).parameters["youngs_modulus"]
+        z.append((result.value - WARP) / result.std)
+        stated.append(result.std / WARP)
     assert 0.018 < np.mean(stated) < 0.035  # 5 % / sqrt(6) = 2.0 %, times Student's 1.3
     assert np.mean(np.abs(z) < 1.96) > 0.8

@@ -12,7 +12,7 @@ import torch
 from helpers.off_axis_strips import NAMES, H, cloth, modulus, readings
 
 from torchcloth.errors import InvalidInput, RecordingError
-from torchcloth.identification import cross_validate, fit_tension, predict_tension, read_tension_model, make_specimen
+from torchcloth.identification import cross_validate, fit_tension, make_specimen, predict_tension, read_tension_model
 from torchcloth.identification.tension.model import add_left_out_misfit
 from torchcloth.identification.tension.specimens import compute_responses
 from torchcloth.recordings import ForceDisplacement
@@ -43,10 +43,10 @@ def strip(degrees: float, rows: int = 11, preload: float = 0.0) -> ForceDisplace
 @pytest.mark.parametrize("degrees", [15, 30, 60, 75, -30, 120])
 def test_the_closed_form_lies_in_the_interval(fit, degrees):
     """The law is right: the parameters' part alone holds Jones's modulus, and is not wider than it needs to be."""
-    found = predict_tension(fit.model, strip(degrees)).force
+    result = predict_tension(fit.model, strip(degrees)).force
     truth = modulus(degrees) * H * 0.02 * 1e-3
-    assert abs(found.value[-1] - truth) < 3 * found.parameter_std[-1]
-    assert found.parameter_std[-1] < 0.03 * truth
+    assert abs(result.value[-1] - truth) < 3 * result.parameter_std[-1]
+    assert result.parameter_std[-1] < 0.03 * truth
 
 
 def test_the_parameters_part_is_the_spread_of_the_covariance(fit):
@@ -90,7 +90,9 @@ def test_a_direction_is_left_out_with_all_its_tables(tables):
     twice = [*tables, readings(45, 0.03, np.random.default_rng(5), count=20)]
     *parts, whole = cross_validate(fit_tension(cloth(), twice, NAMES), cloth(), twice)
     assert [len(part.model.tables) for part in parts] == [3, 2, 3]
-    assert whole.model.tables[1].left_out_misfit["force"] == pytest.approx(whole.model.tables[3].left_out_misfit["force"], abs=0.05)
+    assert whole.model.tables[1].left_out_misfit["force"] == pytest.approx(
+        whole.model.tables[3].left_out_misfit["force"], abs=0.05
+    )
     with pytest.raises(InvalidInput, match="got 2 directions"):
         next(cross_validate(whole, cloth(), [twice[0], twice[1], twice[3]]))
 
@@ -121,8 +123,8 @@ def test_where_the_laws_part_comes_from_is_said(fit, tables):
 
 
 def test_through_the_disk(fit, tmp_path):
-    kept = read_tension_model(fit.save(tmp_path))
-    for model in (kept, read_tension_model(tmp_path)):
+    stored = read_tension_model(fit.save(tmp_path))
+    for model in (stored, read_tension_model(tmp_path)):
         a, b = (predict_tension(m, strip(20)).as_dict() for m in (model, fit.model))
         assert a["force"]["value"] == pytest.approx(b["force"]["value"], rel=1e-9)
         assert a["force"]["std"] == pytest.approx(b["force"]["std"], rel=1e-6)
@@ -138,8 +140,8 @@ def test_a_preload_that_was_not_measured_is_that_of_the_same_slack(fit):
     table, std = make_specimen(model, radians(30))
     assert table.preload == pytest.approx(modulus(30) * H * 0.02 * taut, rel=0.05)
     assert std < 0.1 * table.preload
-    found = predict_tension(model, table, preload_std=0.01).force
-    assert found.setup_std == pytest.approx(np.full(len(table), 0.01), rel=0.05), "a constant force more"
+    result = predict_tension(model, table, preload_std=0.01).force
+    assert result.setup_std == pytest.approx(np.full(len(table), 0.01), rel=0.05), "a constant force more"
     assert make_specimen(model, radians(30), preload=0.0)[1] == 0.0
 
 
@@ -168,8 +170,8 @@ def test_specimens_that_cannot_be(fit, change, said):
 
 
 def test_specimens_that_differ_must_be_named(fit):
-    kept = fit.model.tables
-    model = replace(fit.model, tables=[kept[0], replace(kept[1], width=0.03)])
+    stored = fit.model.tables
+    model = replace(fit.model, tables=[stored[0], replace(stored[1], width=0.03)])
     with pytest.raises(
         InvalidInput, match=r"width; got none; expected a number in metres; the fit's specimens have 0.02"
     ):

@@ -1,6 +1,5 @@
 """One occluded twin episode, and estimates from it, for all tests of this folder."""
 
-
 import pytest
 from helpers import occluded_twins, twins
 

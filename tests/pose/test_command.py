@@ -8,7 +8,7 @@ from helpers import twins
 
 from torchcloth import recordings
 from torchcloth.cli import main
-from torchcloth.identification import load_fitted_cloth, identify
+from torchcloth.identification import identify, load_fitted_cloth
 
 
 @pytest.fixture(scope="module")
@@ -38,12 +38,12 @@ def test_takes_a_fit(scene, folder, tmp_path):
     fit.save(tmp_path)
     other = twins.first(scene.recording, 7)  # not the fitted episode
     cloth, uncertain = load_fitted_cloth(tmp_path, other)
-    found = fit.parameters["youngs_modulus"]
-    assert cloth.material.youngs_modulus.value.item() == pytest.approx(found.value)
-    assert found.identifiable
+    result = fit.parameters["youngs_modulus"]
+    assert cloth.material.youngs_modulus.value.item() == pytest.approx(result.value)
+    assert result.identifiable
     assert set(uncertain) == {"youngs_modulus", "areal_density"}  # the second as it was weighed
     value, factor = uncertain["youngs_modulus"]
-    assert value * (factor - 1) == pytest.approx(found.std, rel=0.1)
+    assert value * (factor - 1) == pytest.approx(result.std, rel=0.1)
 
 
 @pytest.mark.parametrize(

@@ -60,10 +60,10 @@ def test_a_wrong_model_says_so_and_is_still_better_than_itself(scene, wrong):
 def test_stated_uncertainty_is_used(scene, right):
     """The same wrong values, known to within a factor of two: the fabric is corrected, not the force."""
     uncertain = {"youngs_modulus": (WRONG.membrane / twins.THICKNESS, 2.0), "air.normal": (WRONG.drag, 0.6)}
-    found = estimate_pose(model(scene, WRONG), scene.recording, uncertain=uncertain, modes=4, window=0.18)
-    assert rms(found.x, scene, scene.hidden) < 1.2 * rms(right.x, scene, scene.hidden)
-    assert found.fit["force_fraction"] < 0.06
-    assert found.parameters["youngs_modulus"].value == pytest.approx(twins.TRUE.membrane / twins.THICKNESS, rel=0.05)
+    result = estimate_pose(model(scene, WRONG), scene.recording, uncertain=uncertain, modes=4, window=0.18)
+    assert rms(result.x, scene, scene.hidden) < 1.2 * rms(right.x, scene, scene.hidden)
+    assert result.fit["force_fraction"] < 0.06
+    assert result.parameters["youngs_modulus"].value == pytest.approx(twins.TRUE.membrane / twins.THICKNESS, rel=0.05)
 
 
 def test_one_continuous_motion(scene, wrong):
@@ -83,9 +83,9 @@ def test_one_continuous_motion(scene, wrong):
 
 def test_shares_are_those_of_the_weight(wrong, scene):
     cloth = model(scene, WRONG)
-    held = torch.cat([part.index for part in cloth.boundaries.values()])
+    gripped = torch.cat([part.index for part in cloth.boundaries.values()])
     mass = cloth.build_model().mass.detach()[:, 0]
-    mass[held] = 0
+    mass[gripped] = 0
     expected = ((wrong.acceleration.square().sum(-1) * mass).sum(-1) / mass.sum()).sqrt() / 9.81
     torch.testing.assert_close(wrong.force_fractions, expected)
 
@@ -120,13 +120,13 @@ def test_markers_alone(scene):
     xyz[::3, :2] = np.nan
     times = scene.recording.points.t
     recording = replace(scene.recording, points=None, markers=rec.Markers(times, xyz, uv))
-    found = estimate_pose(model(scene, WRONG), recording, modes=4, window=0.18)
-    assert np.isfinite(found.std.numpy()).all()
-    assert rms(found.x, scene, scene.hidden) < 0.6 * rms(found.uncorrected, scene, scene.hidden)
-    assert any("no points" in warning for warning in found.warnings)
-    assert math.isnan(found.fit["point_noise"])
-    assert 0 < float(found.seen.double().mean()) < 1
-    assert len(mesh.vertices) == found.x.shape[1]
+    result = estimate_pose(model(scene, WRONG), recording, modes=4, window=0.18)
+    assert np.isfinite(result.std.numpy()).all()
+    assert rms(result.x, scene, scene.hidden) < 0.6 * rms(result.uncorrected, scene, scene.hidden)
+    assert any("no points" in warning for warning in result.warnings)
+    assert math.isnan(result.fit["point_noise"])
+    assert 0 < float(result.seen.double().mean()) < 1
+    assert len(mesh.vertices) == result.x.shape[1]
 
 
 def test_nothing_need_be_seen_at_the_beginning(scene):
@@ -135,12 +135,12 @@ def test_nothing_need_be_seen_at_the_beginning(scene):
     xyz = np.stack([twins.bilinear(x, twins.FIT, uv) for x in scene.truth.numpy()])
     xyz[: len(xyz) // 2] = np.nan
     markers = rec.Markers(scene.recording.points.t, xyz, uv)
-    found = estimate_pose(
+    result = estimate_pose(
         model(scene, WRONG), replace(scene.recording, points=None, markers=markers), modes=4, window=0.18
     )
     late = scene.hidden.clone()
     late[: len(late) // 2] = False
-    assert rms(found.x, scene, late) < 0.8 * rms(found.uncorrected, scene, late)
+    assert rms(result.x, scene, late) < 0.8 * rms(result.uncorrected, scene, late)
 
 
 def test_nothing_seen_at_all_is_said(scene):
@@ -156,15 +156,15 @@ def test_a_search_that_can_make_no_step_has_not_converged(scene):
     cloth = model(scene, replace(twins.TRUE, membrane=0.2 * twins.TRUE.membrane))
     soft = 0.2 * twins.TRUE.membrane / twins.THICKNESS
     stuck = {"uncertain": {"youngs_modulus": (soft, 4.0)}, "dt": 0.999 * cloth.stable_step()}
-    found = estimate_pose(cloth, scene.recording, modes=2, window=0.35, **stuck)
-    assert not found.fit["converged"]
-    assert any("did not converge" in warning for warning in found.warnings)
+    result = estimate_pose(cloth, scene.recording, modes=2, window=0.35, **stuck)
+    assert not result.fit["converged"]
+    assert any("did not converge" in warning for warning in result.warnings)
 
 
 def test_stated_noise_is_what_points_are_compared_with(scene):
-    found = estimate_pose(model(scene, twins.TRUE), scene.recording, modes=4, window=0.18, noise={"points": 3e-3})
-    assert found.fit["point_noise"] == 3e-3
-    assert found.warnings == []
+    result = estimate_pose(model(scene, twins.TRUE), scene.recording, modes=4, window=0.18, noise={"points": 3e-3})
+    assert result.fit["point_noise"] == 3e-3
+    assert result.warnings == []
 
 
 def test_what_a_gripper_has_let_go_is_as_uncertain_as_the_rest(scene, right):
@@ -173,20 +173,20 @@ def test_what_a_gripper_has_let_go_is_as_uncertain_as_the_rest(scene, right):
     left = replace(hands["left"], closed=hands["left"].t < 0.53)  # until the knot at 0.54 s
     cloth = model(scene, twins.TRUE)
     data = build_episode(cloth, replace(scene.recording, grippers={**hands, "left": left}))
-    held, patch = find_gripped_vertices(cloth, data), cloth.boundaries["left"].index
-    assert torch.equal(held[:, patch].all(1), data.times < 0.54)
-    assert bool(held[:, cloth.boundaries["right"].index].all())
-    finer = estimate_fine_scale_std(right.x, data, right.faces, compute_modes(cloth.mesh), 4, held, 1e-3, 1e-3)
-    assert float(finer[held].max()) < 1e-9
-    assert float(finer[data.times > 0.54][:, patch].min()) > 0.2 * float(finer[~held].median())
+    gripped, patch = find_gripped_vertices(cloth, data), cloth.boundaries["left"].index
+    assert torch.equal(gripped[:, patch].all(1), data.times < 0.54)
+    assert bool(gripped[:, cloth.boundaries["right"].index].all())
+    finer = estimate_fine_scale_std(right.x, data, right.faces, compute_modes(cloth.mesh), 4, gripped, 1e-3, 1e-3)
+    assert float(finer[gripped].max()) < 1e-9
+    assert float(finer[data.times > 0.54][:, patch].min()) > 0.2 * float(finer[~gripped].median())
 
 
 def test_forces_are_no_blindness(scene):
     pull = np.random.default_rng(0).normal(0, 0.05, (len(scene.recording.grippers["left"].t), 3))
     hands = {name: replace(motion, force=pull) for name, motion in scene.recording.grippers.items()}
     felt = replace(scene.recording, grippers=hands)
-    found = estimate_pose(model(scene, twins.TRUE), felt, modes=4, window=0.18, use=["force"])
-    assert not any("seen or felt" in warning for warning in found.warnings)
+    result = estimate_pose(model(scene, twins.TRUE), felt, modes=4, window=0.18, use=["force"])
+    assert not any("seen or felt" in warning for warning in result.warnings)
 
 
 def few(recording, count):
@@ -216,15 +216,15 @@ def test_what_is_not_used_was_not_seen(scene, use, noise):
     markers = rec.Markers(scene.recording.points.t, xyz, uv)
     whole = replace(scene.recording, grippers=grippers, markers=markers, observation_noise_std=noise)
     ask = partial(estimate_pose, model(scene, WRONG), modes=4, window=0.18, use=[use])
-    found, alone = ask(whole), ask(replace(whole, points=None))
-    torch.testing.assert_close(found.x, alone.x)
-    torch.testing.assert_close(found.std, alone.std)
-    assert torch.equal(found.seen, alone.seen)
-    assert bool(found.seen.any()) == (use == "markers")
-    said = [[w for w in e.warnings if "rigidly" not in w] for e in (found, alone)]  # that is of distances
+    result, alone = ask(whole), ask(replace(whole, points=None))
+    torch.testing.assert_close(result.x, alone.x)
+    torch.testing.assert_close(result.std, alone.std)
+    assert torch.equal(result.seen, alone.seen)
+    assert bool(result.seen.any()) == (use == "markers")
+    said = [[w for w in e.warnings if "rigidly" not in w] for e in (result, alone)]  # that is of distances
     assert said[0] == said[1]
-    assert math.isfinite(found.fit["chamfer_after"])
-    assert math.isnan(found.fit["point_noise"])
+    assert math.isfinite(result.fit["chamfer_after"])
+    assert math.isnan(result.fit["point_noise"])
 
 
 @pytest.mark.parametrize(
@@ -248,22 +248,24 @@ def test_bad_options(scene, options, match):
 
 def test_a_late_clock_sees_beyond_the_last_stamp(scene, monkeypatch):
     """Frames taken later than they say: the last is where the cloth was then, which takes simulating on."""
-    late, kept = 0.6 / twins.RATE, slice(0, -4)
+    late, stored = 0.6 / twins.RATE, slice(0, -4)
     points = scene.recording.points
-    counts = points.counts[kept]
-    stamps = np.concatenate([points.t[:1], points.t[kept][1:] - late])
+    counts = points.counts[stored]
+    stamps = np.concatenate([points.t[:1], points.t[stored][1:] - late])
     seen = replace(scene.recording, points=replace(points, t=stamps, counts=counts, xyz=points.xyz[: counts.sum()]))
 
-    def last(found):
-        assert len(found.times) == len(found.x) == len(found.v) == len(found.seen) == len(found.null) == len(counts)
-        assert float(found.windows[-1, 1]) == pytest.approx(float(found.times[-1]))
-        return float((found.x[-1] - scene.truth[len(counts) - 1]).norm(dim=-1).square().mean().sqrt())
+    def last(result):
+        assert (
+            len(result.times) == len(result.x) == len(result.v) == len(result.seen) == len(result.null) == len(counts)
+        )
+        assert float(result.windows[-1, 1]) == pytest.approx(float(result.times[-1]))
+        return float((result.x[-1] - scene.truth[len(counts) - 1]).norm(dim=-1).square().mean().sqrt())
 
     ask = partial(estimate_pose, model(scene, twins.TRUE), seen, nuisances={"clock": 0.03}, modes=4, window=0.18)
-    found = ask()
-    assert found.nuisances["clock"].value == pytest.approx(late, rel=0.1)
+    result = ask()
+    assert result.nuisances["clock"].value == pytest.approx(late, rel=0.1)
     monkeypatch.setattr(nuisances, "MAX_CLOCK_OFFSET_STDS", 0.0)
-    assert last(found) < 0.5 * last(ask())
+    assert last(result) < 0.5 * last(ask())
 
 
 def test_few_points_of_each_frame_tell_together(scene):
@@ -271,8 +273,15 @@ def test_few_points_of_each_frame_tell_together(scene):
     cloth = model(scene, WRONG)
     data = build_episode(cloth, scene.recording)
     few = replace(data, clouds=[cloud[:12] for cloud in data.clouds])
-    held, modes, x = find_gripped_vertices(cloth, data), compute_modes(cloth.mesh), scene.truth + 5e-3 * torch.sin(40 * scene.truth)
-    std = [estimate_fine_scale_std(x, some, torch.as_tensor(cloth.mesh.faces), modes, 4, held, 1e-3, 1e-3) for some in (data, few)]
+    gripped, modes, x = (
+        find_gripped_vertices(cloth, data),
+        compute_modes(cloth.mesh),
+        scene.truth + 5e-3 * torch.sin(40 * scene.truth),
+    )
+    std = [
+        estimate_fine_scale_std(x, subset, torch.as_tensor(cloth.mesh.faces), modes, 4, gripped, 1e-3, 1e-3)
+        for subset in (data, few)
+    ]
     sizes = [float(s.square().mean().sqrt()) for s in std]
     assert sizes[0] > 1e-3
     assert 0.3 < sizes[1] / sizes[0] < 3
@@ -281,7 +290,7 @@ def test_few_points_of_each_frame_tell_together(scene):
 def test_the_values_that_it_moved_with_can_be_set(scene):
     uncertain = {"youngs_modulus": (WRONG.membrane / twins.THICKNESS, 2.0)}
     cloth = model(scene, WRONG)
-    found = estimate_pose(cloth, scene.recording, uncertain=uncertain, modes=2, window=0.3)
-    value = found.parameters["youngs_modulus"].value
+    result = estimate_pose(cloth, scene.recording, uncertain=uncertain, modes=2, window=0.3)
+    value = result.parameters["youngs_modulus"].value
     assert value > 1.2 * uncertain["youngs_modulus"][0]
-    assert float(found.apply(cloth).material.youngs_modulus.value.detach()) == pytest.approx(value)
+    assert float(result.apply(cloth).material.youngs_modulus.value.detach()) == pytest.approx(value)

@@ -8,7 +8,7 @@ import torch
 
 import torchcloth as tc
 from torchcloth.errors import InvalidInput
-from torchcloth.pose.fine_scale_uncertainty import _basis
+from torchcloth.pose.fine_scale_uncertainty import _build_basis
 from torchcloth.pose.modes import Modes, compute_modes
 
 
@@ -41,10 +41,10 @@ def test_too_many(count):
         compute_modes(tc.meshes.rectangle(0.3, 0.3, resolution=(4, 4)), count)
 
 
-@pytest.mark.parametrize(("size", "told"), [((0.3, 0.3), [2, 5, 7]), ((0.3, 0.2), [])])
-def test_modes_that_symmetry_makes_equal_are_not_divided_silently(size, told):
+@pytest.mark.parametrize(("size", "informed"), [((0.3, 0.3), [2, 5, 7]), ((0.3, 0.2), [])])
+def test_modes_that_symmetry_makes_equal_are_not_divided_silently(size, informed):
     modes = compute_modes(tc.meshes.rectangle(*size, resolution=(8, 8)))
-    assert [count for count in range(1, 9) if modes.truncation_warnings(count)] == told
+    assert [count for count in range(1, 9) if modes.truncation_warnings(count)] == informed
     assert "take 1 or 3" in compute_modes(tc.meshes.rectangle(0.3, 0.3, resolution=(8, 8))).truncation_warnings(2)[0]
 
 
@@ -67,8 +67,8 @@ def test_so_have_two_sheets_and_what_is_left_of_one_mode_is_no_less_than_of_one_
     modes = compute_modes(two_sheets())
     assert modes.wave_numbers[:2].tolist() == [0.0, 0.0]
     assert modes.truncation_warnings(1)
-    held = torch.tensor([0, 1, 20, 21])
-    basis = _basis(modes, 1, held)
+    gripped = torch.tensor([0, 1, 20, 21])
+    basis = _build_basis(modes, 1, gripped)
     assert len(basis) > 4
     torch.testing.assert_close(basis.square().sum(0).mean(), torch.ones(()), rtol=0, atol=1e-9)
-    assert float(basis[:, held].abs().max()) < 1e-9
+    assert float(basis[:, gripped].abs().max()) < 1e-9

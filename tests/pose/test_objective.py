@@ -21,10 +21,14 @@ from torchcloth.pose.objective import CorrectedObjective, CorrectiveForce, add_c
 def objective(scene):
     cloth = model(scene, twins.TRUE)
     data = build_episode(cloth, twins.first(scene.recording, 6))
-    correction = CorrectiveForce(split_into_windows(data.times, 0.1), compute_modes(cloth.mesh, 2).fields, torch.full((2,), 0.5))
+    correction = CorrectiveForce(
+        split_into_windows(data.times, 0.1), compute_modes(cloth.mesh, 2).fields, torch.full((2,), 0.5)
+    )
     nuisances = select_nuisances(["clock", "grasp", "shape"], ["rim"])
     unknowns = collect_unknowns(cloth, ["youngs_modulus"], None)
-    return CorrectedObjective(add_correction_effect(cloth), unknowns, data, correction, None, nuisances, select_blocks(None))
+    return CorrectedObjective(
+        add_correction_effect(cloth), unknowns, data, correction, None, nuisances, select_blocks(None)
+    )
 
 
 def test_without_force_it_is_the_simulation(objective, scene):
@@ -61,9 +65,9 @@ def test_a_later_force_moves_nothing_before(objective):
     _, moved = objective.simulate_with_tangents(objective.start)
     each = objective.force.count_per_window
     for w, (first, _) in enumerate(objective.force.windows):
-        own = moved.x[objective.force_slice.start + w * each : objective.force_slice.start + (w + 1) * each]
-        assert float(own[:, : first + 1].abs().max()) == 0.0 or w == 0  # the first acts while the cloth settles
-        assert float(own[:, first + 1].abs().max()) > 0
+        of_part = moved.x[objective.force_slice.start + w * each : objective.force_slice.start + (w + 1) * each]
+        assert float(of_part[:, : first + 1].abs().max()) == 0.0 or w == 0  # the first acts while the cloth settles
+        assert float(of_part[:, first + 1].abs().max()) > 0
 
 
 @pytest.mark.parametrize(("times", "length"), [(torch.arange(10) / 30, 0.1), (torch.arange(3) * 0.5, 0.1)])
@@ -87,7 +91,9 @@ def test_windows_far_from_zero():
 
 def test_a_part_is_the_beginning_of_the_same_motion(objective):
     part, raw = objective.first_fraction(0.5), objective.start + 0.3 * objective.prior_std
-    torch.testing.assert_close(part.simulate_vertices(raw)[0][:3], objective.simulate_vertices(raw)[0][:3])  # the last has no end to lean on
+    torch.testing.assert_close(
+        part.simulate_vertices(raw)[0][:3], objective.simulate_vertices(raw)[0][:3]
+    )  # the last has no end to lean on
 
 
 def test_the_early_frames_of_a_fit_are_the_beginning_of_the_same_motion(scene):
@@ -96,4 +102,6 @@ def test_the_early_frames_of_a_fit_are_the_beginning_of_the_same_motion(scene):
     data = build_episode(cloth, twins.first(scene.recording, 8))
     whole = Objective(cloth, collect_unknowns(cloth, ["youngs_modulus"], None), [data])
     raw = whole.start + 0.1
-    torch.testing.assert_close(whole.first_fraction(0.5).simulate_vertices(raw)[0], whole.simulate_vertices(raw)[0][:4], rtol=0, atol=1e-12)
+    torch.testing.assert_close(
+        whole.first_fraction(0.5).simulate_vertices(raw)[0], whole.simulate_vertices(raw)[0][:4], rtol=0, atol=1e-12
+    )

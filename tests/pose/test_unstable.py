@@ -29,10 +29,12 @@ def cloth(shape):
 def shaken(frames):
     """(recording, the truth at the fitted mesh's vertices [T, V, 3])."""
     draw, truth, t = np.random.default_rng(0), cloth(twins.TRUTH), np.arange(frames) / RATE
-    own = np.linspace(0, t[-1], 60)
-    sway, still = 0.04 * (1 - np.cos(2 * np.pi * 2.5 * own)), np.tile([1.0, 0, 0, 0], (60, 1))
+    of_part = np.linspace(0, t[-1], 60)
+    sway, still = 0.04 * (1 - np.cos(2 * np.pi * 2.5 * of_part)), np.tile([1.0, 0, 0, 0], (60, 1))
     motion = {
-        name: rec.GripperMotion(own, np.stack([0.9 * u + 0 * own, sway, 1 + 0 * own], 1), still, np.ones(60, bool))
+        name: rec.GripperMotion(
+            of_part, np.stack([0.9 * u + 0 * of_part, sway, 1 + 0 * of_part], 1), still, np.ones(60, bool)
+        )
         for name, u in (("left", -SIDE / 2), ("right", SIDE / 2))
     }
     u, v = torch.as_tensor(truth.mesh.uv).T
@@ -59,8 +61,8 @@ def test_an_unstable_motion_is_followed_and_said():
     """8 fields over 1.25 s, where normal equations lost all digits; the estimate says that it is one of many."""
     with twins.doubles():
         recording, truth = shaken(26)
-        found = estimate_pose(cloth(FIT), recording, modes=8)
-    off, alone = ((x - truth).square().sum(-1).mean().sqrt() for x in (found.x, found.uncorrected))
+        result = estimate_pose(cloth(FIT), recording, modes=8)
+    off, alone = ((x - truth).square().sum(-1).mean().sqrt() for x in (result.x, result.uncorrected))
     assert float(off) < 0.75 * float(alone)
-    assert not found.fit["converged"]
-    assert any("the motion is unstable: from 0." in warning for warning in found.warnings)
+    assert not result.fit["converged"]
+    assert any("the motion is unstable: from 0." in warning for warning in result.warnings)

@@ -12,7 +12,7 @@ from torchcloth import recordings
 from torchcloth.dynamics.contact import Contact
 from torchcloth.effects import AirDrag, Gravity
 from torchcloth.errors import InvalidInput, RecordingError, UnstableStep
-from torchcloth.identification import build_cloth, load_fitted_cloth, identify, predict_episode, replay_fit
+from torchcloth.identification import build_cloth, identify, load_fitted_cloth, predict_episode, replay_fit
 from torchcloth.identification.io.saved_fit import read_saved_fit
 from torchcloth.identification.io.unrecorded_settings import find_unrecorded_settings
 
@@ -161,7 +161,10 @@ DAMAGE = {
     "contact spacing a word": (put("model", "contact", value={**CONTACT, "spacing": "x"}), "contact spacing 'x' where"),
     "contact without width": (put("model", "contact", value={**CONTACT, "spacing": 0}), "contact spacing 0 where"),
     "contact of halves": (put("model", "contact", value={**CONTACT, "subdivisions": 2.5}), "subdivisions"),
-    "contact that plays": (put("model", "contact", value={**CONTACT, "free_compression": 2.0}), "contact free_compression; got 2.0"),
+    "contact that plays": (
+        put("model", "contact", value={**CONTACT, "free_compression": 2.0}),
+        "contact free_compression; got 2.0",
+    ),
     "contact of nothing": (put("model", "contact", value={"gap": 0.1}), "unexpected keyword argument 'gap'"),
     "no correlation": (put("correlation", value={}), "no fitted parameter in correlation"),
     "no step": (put("model", "dt", value=0), "dt 0 where"),

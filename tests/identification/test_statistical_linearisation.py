@@ -22,7 +22,7 @@ from torchcloth.identification.estimators import (
 )
 from torchcloth.identification.estimators.objective import Objective
 from torchcloth.identification.nuisances import select_nuisances
-from torchcloth.identification.residuals.blocks import BLOCKS
+from torchcloth.identification.residuals.blocks import RESIDUAL_BLOCKS
 
 TRUE = {"youngs_modulus": 129.32e3, "air.normal": 1.2}
 RIPPLES = 3e-3  # m
@@ -31,9 +31,9 @@ RIPPLES = 3e-3  # m
 @pytest.fixture(scope="module")
 def swung(tmp_path_factory):
     """What ``torchcloth simulate`` makes of a sheet of 129 N/m and 1e-5 N m that is swung, for a second and a third."""
-    order = synthesis.Order("sheet", "swing", fabric="dress", triangles=98, arms=False)
+    order = synthesis.EpisodeSpec("sheet", "swing", fabric="dress", triangles=98, arms=False)
     with twins.doubles():
-        made = synthesis.make(order, tmp_path_factory.mktemp("images"))
+        made = synthesis.make_episode(order, tmp_path_factory.mktemp("images"))
     frames, count = 20, int(made.points.counts[:20].sum())
     points = recordings.PointClouds(made.points.t[:frames], made.points.xyz[:count], made.points.counts[:frames])
     return replace(made, points=points, observation_noise_std=None)  # its first shape is exact
@@ -44,10 +44,10 @@ def test_a_light_sheet_that_buckles_is_identified_from_what_can_be_predicted(swu
     model, options = build_cloth(swung), {"iterations": 5, "journal": tmp_path / "journal"}
     fit = identify(model, swung, list(TRUE), **options)  # few iterations: tangents of the whole lead nowhere
     for name, truth in TRUE.items():
-        found = fit.parameters[name]
-        assert found.identifiable
-        assert found.std < 0.05 * truth
-        assert abs(found.value - truth) < 3 * found.std, (name, found)
+        result = fit.parameters[name]
+        assert result.identifiable
+        assert result.std < 0.05 * truth
+        assert abs(result.value - truth) < 3 * result.std, (name, result)
     assert fit.fit["converged"]
     assert "derivatives hold for the first 0." in fit.warnings[0]
     assert "of 20, were used" in fit.warnings[0]
@@ -60,11 +60,18 @@ def test_a_light_sheet_that_buckles_is_identified_from_what_can_be_predicted(swu
 
 def test_tangents_of_a_light_sheet_run_away_and_those_of_its_beginning_do_not(swung):
     model = build_cloth(swung)
-    whole = Objective(model, collect_unknowns(model, list(TRUE), None), [build_episode(model, swung)], nuisances=select_nuisances([], ["rim"]))
+    whole = Objective(
+        model,
+        collect_unknowns(model, list(TRUE), None),
+        [build_episode(model, swung)],
+        nuisances=select_nuisances([], ["rim"]),
+    )
     for objective, away in ((whole, True), (whole.first_fraction(0.3), False)):
         linear = objective.linearise(objective.start)
         assert (
-            linearity.has_runaway_tangents(objective, levenberg_marquardt.evaluate_point(objective.problem(), objective.start, linear))
+            linearity.has_runaway_tangents(
+                objective, levenberg_marquardt.evaluate_point(objective.problem(), objective.start, linear)
+            )
             == away
         )
 
@@ -78,7 +85,7 @@ class Rippling:
     The data are what the same system shows for the true values: with ripples of its own.
     """
 
-    nuisances, blocks = (), BLOCKS[:1]
+    nuisances, blocks = (), RESIDUAL_BLOCKS[:1]
     cloth = SimpleNamespace(boundaries={})
     episodes = (SimpleNamespace(needs_settling=False, noise_std=None),)
 
@@ -91,7 +98,9 @@ class Rippling:
         rows, windows = len(self.frame), int(self.frame.max()) + 1
         self.waves = 400 * torch.randn(windows, least_squares.PATCHES, 3, generator=generator, dtype=torch.float64)
         self.phase = 6 * torch.rand(windows, least_squares.PATCHES, generator=generator, dtype=torch.float64)
-        self.data = self._shown(least_squares.TRUE) + least_squares.SIGMA * torch.randn(rows, generator=generator, dtype=torch.float64)
+        self.data = self._shown(least_squares.TRUE) + least_squares.SIGMA * torch.randn(
+            rows, generator=generator, dtype=torch.float64
+        )
         self.unknowns, self.start, self.simulations = [0, 1, 2], torch.zeros(3, dtype=torch.float64), 0
         self.prior_std = torch.full((3,), 5.0, dtype=torch.float64)
 
@@ -118,7 +127,7 @@ class Rippling:
         x = torch.stack([raw, 2 * raw])[None]
         return [Frames(x, 0 * x, {}, torch.zeros(1))]
 
-    def distance(self, raw):
+    def mean_distance(self, raw):
         return float((self._shown(raw) - self.data).abs().mean())
 
 
@@ -129,21 +138,21 @@ def test_simulations_around_a_point_see_through_ripples():
     """20 problems: unbiased, errors of the size that is stated, some times smaller than the ripples would make them."""
     z, stds = [], []
     for seed in range(20):
-        found = statistical_linearisation.fit_by_sampling(Rippling(seed), FAILED, None, 8, lambda raw: None)
-        deviation = found.covariance.diagonal().sqrt()
-        z.append((found.final.raw - least_squares.TRUE) / deviation)
+        result = statistical_linearisation.fit_by_sampling(Rippling(seed), FAILED, None, 8, lambda raw: None)
+        deviation = result.covariance.diagonal().sqrt()
+        z.append((result.final.raw - least_squares.TRUE) / deviation)
         stds.append(deviation)
-        assert found.final.converged
+        assert result.final.converged
     z = torch.stack(z)
     assert abs(float(z.mean())) < 0.4
     assert 0.6 < float(z.std()) < 1.4
     assert float(torch.stack(stds).mean()) < 0.2
-    assert float(found.influence.position[0]) == pytest.approx(math.sqrt(0.5 * (1 + 4)), rel=1e-6)
+    assert float(result.influence.position[0]) == pytest.approx(math.sqrt(0.5 * (1 + 4)), rel=1e-6)
 
 
 def test_what_nothing_tells_stays_open_under_ripples():
-    found = statistical_linearisation.fit_by_sampling(Rippling(0, blind=True), FAILED, None, 8, lambda raw: None)
-    deviation = found.covariance.diagonal().sqrt()
+    result = statistical_linearisation.fit_by_sampling(Rippling(0, blind=True), FAILED, None, 8, lambda raw: None)
+    deviation = result.covariance.diagonal().sqrt()
     assert float(deviation[2]) > 1.0
     assert float(deviation[:2].max()) < 0.3
 
@@ -171,7 +180,8 @@ def test_it_starts_where_all_frames_are_nearer(monkeypatch, known, failed):
     monkeypatch.setattr(statistical_linearisation, "_search", settle)
     begun = predictability.PredictableFit(problem, FAILED._replace(final=at["k"]), 0.5)
     assert (
-        statistical_linearisation.fit_by_sampling(problem, FAILED._replace(final=at["f"]), begun, 8, lambda raw: None) is None
+        statistical_linearisation.fit_by_sampling(problem, FAILED._replace(final=at["f"]), begun, 8, lambda raw: None)
+        is None
     )
     assert starts == [0.0 if known == 0.0 else 1.0]
 
@@ -205,20 +215,20 @@ def test_the_beginning_grows_until_derivatives_fail(monkeypatch):
 
     monkeypatch.setattr(predictability, "_solve_part", solved)
     whole = SimpleNamespace(episodes=[motion(100)])
-    found = predictability.fit_predictable_part(whole, FAILED, torch.tensor(0.0), lambda it, o: False)
+    result = predictability.fit_predictable_part(whole, FAILED, torch.tensor(0.0), lambda it, o: False)
     shares, starts, tolerances = zip(*asked, strict=True)
     assert shares == pytest.approx([0.1, 0.15, 0.22, 0.33, 0.5, 0.415, 0.4575, 0.415])
     assert starts == pytest.approx([0.0, 0.0, 0.15, 0.22, 0.33, 0.33, 0.415, 0.415])
     assert tolerances == (*[1.0] * 7, 0.1)
-    assert "42 of 100, were used" in found.checked.warnings[0]
+    assert "42 of 100, were used" in result.checked.warnings[0]
 
 
 def test_of_the_beginning_combinations_are_known_as_such():
     """Of two unknowns with their sum well known, each alone is not; as two priors they said sqrt(1/2) of that."""
-    told, known = torch.zeros(3, dtype=torch.float64), torch.eye(3, dtype=torch.float64)
+    informed, known = torch.zeros(3, dtype=torch.float64), torch.eye(3, dtype=torch.float64)
     known[0, 1] = known[1, 0] = -0.95
     known[2, 2] = 1e6  # less than the fit's own prior
-    problem = statistical_linearisation._with_prior(Rippling(0).problem(), told, 0.01 * known)
+    problem = statistical_linearisation._with_prior(Rippling(0).problem(), informed, 0.01 * known)
     torch.testing.assert_close(torch.linalg.inv(problem.precision)[:2, :2], 0.01 * known[:2, :2])
     assert float(problem.prior_std[2]) == float(Rippling(0).problem().prior_std[2])
     assert float(problem.precision[2, 2]) == pytest.approx(float(problem.prior_std[2]) ** -2)

@@ -38,9 +38,9 @@ def test_a_grip_holds_the_new_vertices_between_those_it_held():
     mesh = tc.meshes.rectangle(0.2, 0.2, resolution=(3, 3))
     sheet = tc.Cloth(mesh, tc.materials.AEP(1e5), 0.2, boundaries={"bar": Grasp([0, 1, 2])}, contact=None)
     fine = refine_cloth(sheet)
-    held = np.asarray(fine.mesh.uv)[fine.boundaries["bar"].index]
-    assert sorted(held[:, 1].round(6).tolist()) == [0.0, 0.05, 0.1, 0.15, 0.2]
-    assert (held[:, 0] == 0).all()
+    gripped = np.asarray(fine.mesh.uv)[fine.boundaries["bar"].index]
+    assert sorted(gripped[:, 1].round(6).tolist()) == [0.0, 0.05, 0.1, 0.15, 0.2]
+    assert (gripped[:, 0] == 0).all()
 
 
 @pytest.mark.parametrize(
@@ -94,10 +94,10 @@ def test_a_finer_mesh_that_cannot_be_simulated_leaves_the_fit_and_says_so(model,
         raise SimulationDiverged("the cloth is torn apart")
 
     monkeypatch.setattr(fit, "mesh_correction", torn)
-    found = identify(model, brief, ["youngs_modulus"], iterations=1, refine=True)
-    assert found.parameters == one_step.parameters
-    assert "mesh_correction" not in found.fit
-    assert any("not corrected for the coarseness of the mesh: on a finer one, the cloth" in w for w in found.warnings)
+    result = identify(model, brief, ["youngs_modulus"], iterations=1, refine=True)
+    assert result.parameters == one_step.parameters
+    assert "mesh_correction" not in result.fit
+    assert any("not corrected for the coarseness of the mesh: on a finer one, the cloth" in w for w in result.warnings)
 
 
 def test_it_moves_towards_what_a_finer_mesh_finds(recording, model, plain):
@@ -135,10 +135,10 @@ def test_a_sewn_mesh_keeps_its_pattern():
     coarse = tc.Cloth(mesh, law, 0.15, boundaries=grip, contact=None)
     fine = refine_cloth(coarse)
     for stretch in ([1.05, 1.0, 1.0], [1.0, 1.05, 1.0]):
-        own, other = (
+        of_part, other = (
             sum(c.energy(c.state(torch.as_tensor(c.mesh.vertices * stretch))).values()).item() for c in (coarse, fine)
         )
-        assert other == pytest.approx(own, rel=1e-6)
+        assert other == pytest.approx(of_part, rel=1e-6)
 
 
 def test_a_late_clock_is_no_difference_between_meshes(recording):
@@ -146,9 +146,9 @@ def test_a_late_clock_is_no_difference_between_meshes(recording):
     moved = {n: _later(g, 0.03) for n, g in late.grippers.items()}  # frames were taken 30 ms after they say
     late = replace(late, grippers=moved)
     names, clock = ["youngs_modulus", "air.normal"], {"clock": 0.03}
-    found = identify(twins.at(late), late, names, nuisances=clock, refine=True).parameters["air.normal"]
-    assert found.value == pytest.approx(twins.TRUE.drag, abs=3 * found.std)
-    assert found.std < 0.05
+    result = identify(twins.at(late), late, names, nuisances=clock, refine=True).parameters["air.normal"]
+    assert result.value == pytest.approx(twins.TRUE.drag, abs=3 * result.std)
+    assert result.std < 0.05
 
 
 def _later(g, by):
@@ -175,6 +175,6 @@ def test_a_correction_that_cannot_be_simulated_is_none(model, brief, one_step, m
 
     ended = []
     monkeypatch.setattr(fit, "mesh_correction", step)
-    found = identify(model, brief, ["youngs_modulus"], iterations=1, refine=True)
-    assert found.parameters == one_step.parameters
-    assert any("not corrected for the coarseness of the mesh: on a finer one, the cloth" in w for w in found.warnings)
+    result = identify(model, brief, ["youngs_modulus"], iterations=1, refine=True)
+    assert result.parameters == one_step.parameters
+    assert any("not corrected for the coarseness of the mesh: on a finer one, the cloth" in w for w in result.warnings)

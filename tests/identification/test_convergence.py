@@ -33,16 +33,16 @@ def test_a_search_cut_short_far_off_says_nothing(brief_pull, noise_known):
     p = brief_pull
     episode = p.recording if noise_known else replace(p.recording, observation_noise_std=None)
     fit = identify(p.cloth, episode, p.names, nuisances=NUISANCES, iterations=1)
-    found = fit.parameters["membrane_stiffness"]
-    assert abs(found.value / MEMBRANE - 1) > 0.2, "the scene must be a hard one"
+    result = fit.parameters["membrane_stiffness"]
+    assert abs(result.value / MEMBRANE - 1) > 0.2, "the scene must be a hard one"
     assert not fit.fit["converged"]
     assert not any(fit.parameters[name].identifiable for name in p.names)
-    assert found.ci95[0] < MEMBRANE < found.ci95[1]
+    assert result.ci95[0] < MEMBRANE < result.ci95[1]
     why = "times the sensor noise" if noise_known else "standard errors farther"
     end = f"stopped after {fit.fit['iterations']} iterations"
     assert any(w.startswith(end) and why in w and "more iterations" in w for w in fit.warnings)
-    kept = fit.apply(p.cloth).material.youngs_modulus
-    assert kept.value.item() == pytest.approx(p.cloth.material.youngs_modulus.value.item()), "no value is taken over"
+    stored = fit.apply(p.cloth).material.youngs_modulus
+    assert stored.value.item() == pytest.approx(p.cloth.material.youngs_modulus.value.item()), "no value is taken over"
 
 
 def test_the_papers_stop_at_a_start_that_is_far_off_says_nothing(brief_pull, monkeypatch):
@@ -56,11 +56,11 @@ def test_the_papers_stop_at_a_start_that_is_far_off_says_nothing(brief_pull, mon
 
 def test_a_search_cut_short_at_the_noise_keeps_its_answer(brief, one_step):
     fit = one_step
-    found = fit.parameters["youngs_modulus"]
+    result = fit.parameters["youngs_modulus"]
     assert not fit.fit["converged"]
     assert fit.fit["rms_after"] < CONVERGENCE_CRITERIA.max_residual_over_noise * brief.observation_noise_std
-    assert found.identifiable
-    assert abs(found.value - twins.TRUE.membrane / twins.THICKNESS) < 3 * found.std
+    assert result.identifiable
+    assert abs(result.value - twins.TRUE.membrane / twins.THICKNESS) < 3 * result.std
 
 
 def test_without_a_stated_noise_the_way_that_is_left_decides(model, brief):
@@ -74,10 +74,10 @@ def test_a_sheet_between_free_clamps_is_found_from_far_off():
     """Drag and bending, which this pull hardly tells, ask for steps longer than allowed: E must not wait for them."""
     p = sheet(30)
     fit = identify(p.cloth, p.recording, p.names, nuisances=NUISANCES)
-    found = fit.parameters["membrane_stiffness"]
+    result = fit.parameters["membrane_stiffness"]
     assert fit.fit["converged"]
-    assert found.identifiable
-    assert found.value == pytest.approx(MEMBRANE, rel=0.05)  # cells of 50 mm: 1.5 % too stiff
+    assert result.identifiable
+    assert result.value == pytest.approx(MEMBRANE, rel=0.05)  # cells of 50 mm: 1.5 % too stiff
     assert fit.fit["rms_after"] < CONVERGENCE_CRITERIA.max_residual_over_noise * p.recording.observation_noise_std
 
 
@@ -91,7 +91,9 @@ def test_simulations_around_a_solution_that_is_far_off_say_nothing(model, brief,
 
     def around(self, failed, start, iterations):
         size = len(failed.final.raw)
-        return self.objective, failed._replace(failure_reason="", covariance=1e-4 * torch.eye(size).to(failed.final.raw))
+        return self.objective, failed._replace(
+            failure_reason="", covariance=1e-4 * torch.eye(size).to(failed.final.raw)
+        )
 
     monkeypatch.setattr(linearity, "check_linearity", failing)
     monkeypatch.setattr(Search, "_resolve_unstable", around)

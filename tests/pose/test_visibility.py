@@ -52,7 +52,7 @@ def test_few_points_tell_of_their_surroundings(mesh):
 def test_markers(mesh):
     uv = torch.tensor([[0.01, 0.01], [0.29, 0.29]], dtype=torch.float64)
     markers = torch.tensor([[[0.01, 0.01, 0.0], [torch.nan] * 3]], dtype=torch.float64)
-    data = episode(mesh, [torch.zeros(0, 3)], markers=markers, places=locate_on_pattern(mesh, uv.numpy()))
+    data = episode(mesh, [torch.zeros(0, 3)], markers=markers, marker_places=locate_on_pattern(mesh, uv.numpy()))
     seen = find_seen_vertices(torch.as_tensor(mesh.vertices)[None], data, mesh)
     assert seen[0].sum() == 3
     assert float(torch.as_tensor(mesh.uv)[seen[0]].max()) < 0.06

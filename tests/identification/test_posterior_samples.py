@@ -48,12 +48,12 @@ def test_what_nobody_knows_stays_a_fabric(fit, tmp_path):
     (tmp_path / "identification.json").write_text(json.dumps(content))
     cloths = sample_posterior(tmp_path, recording, 20)
     for name in names:
-        own = [values(c, name) for c in cloths]
-        assert min(own) >= 0
-        assert all(math.isfinite(value) for value in own)
+        of_part = [values(c, name) for c in cloths]
+        assert min(of_part) >= 0
+        assert all(math.isfinite(value) for value in of_part)
         if name == "youngs_modulus":
-            assert max(own) <= 10.001 * own[0]
-            assert min(own) >= own[0] / 10.001
+            assert max(of_part) <= 10.001 * of_part[0]
+            assert min(of_part) >= of_part[0] / 10.001
 
 
 def test_the_same_seed_draws_the_same(fit):
@@ -69,5 +69,5 @@ def test_an_amplitude_is_drawn_by_its_errors_alone(fit, tmp_path):
     content["model"]["values"]["air.normal"] = 40.0
     content["parameters"]["air.normal"]["std"] = 5.0
     (tmp_path / "identification.json").write_text(json.dumps(content))
-    own = [values(c, "air.normal") for c in sample_posterior(tmp_path, recording, 200)]
-    assert np.std(own) == pytest.approx(5.0, rel=0.2)
+    of_part = [values(c, "air.normal") for c in sample_posterior(tmp_path, recording, 200)]
+    assert np.std(of_part) == pytest.approx(5.0, rel=0.2)

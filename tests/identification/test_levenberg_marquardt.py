@@ -132,12 +132,17 @@ def test_few_readings_of_one_kind_are_few_beside_many_of_another(rows):
     many = 600
     jacobian = torch.zeros(many + rows, 2, dtype=torch.float64)
     jacobian[:many, 0], jacobian[many:, 1] = 1.0, torch.linspace(0.5, 1, rows, dtype=torch.float64)
-    where, block = torch.arange(many + rows) * levenberg_marquardt.DEFAULT_NOISE_MODEL.frames_per_time_block, (torch.arange(many + rows) >= many).long()
+    where, block = (
+        torch.arange(many + rows) * levenberg_marquardt.DEFAULT_NOISE_MODEL.frames_per_time_block,
+        (torch.arange(many + rows) >= many).long(),
+    )
     hits = []
     for seed in range(400):
         generator = torch.Generator().manual_seed(seed)
         true, noise = (torch.randn(n, generator=generator, dtype=torch.float64) for n in (2, many + rows))
-        toy = least_squares.Toy(lambda raw: jacobian @ raw, jacobian @ true + 0.01 * noise, where, 0 * where, unknowns=2)
+        toy = least_squares.Toy(
+            lambda raw: jacobian @ raw, jacobian @ true + 0.01 * noise, where, 0 * where, unknowns=2
+        )
         kinds = toy.problem()._replace(linearise=lambda raw, toy=toy: toy._linearise(raw)._replace(block=block))
         final = minimise(kinds, torch.zeros(2, dtype=torch.float64), 35, lambda _: False)
         hits.append((final.raw - true).abs() < 1.96 * covariance(kinds, final).diagonal().sqrt())
@@ -157,12 +162,14 @@ def test_errors_do_not_hang_on_the_rate_of_frames():
             noise = root @ torch.randn(len(t), generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
             toy = least_squares.Toy(lambda raw, j=jacobian: j @ raw, 0.01 * noise, frame, 0 * frame, unknowns=2)
             moment = frame // (rate // 30)
-            slow = toy.problem()._replace(linearise=lambda raw, t=toy, m=moment: t._linearise(raw)._replace(time_block=m))
+            slow = toy.problem()._replace(
+                linearise=lambda raw, t=toy, m=moment: t._linearise(raw)._replace(time_block=m)
+            )
             final = minimise(slow, torch.zeros(2, dtype=torch.float64), 35, lambda _: False)
             stated.setdefault(rate, []).append(covariance(slow, final).diagonal().sqrt())
             errors.setdefault(rate, []).append(final.raw)
-    at = {rate: float(torch.stack(own).square().mean().sqrt()) for rate, own in stated.items()}
-    true = {rate: float(torch.stack(own).square().mean().sqrt()) for rate, own in errors.items()}
+    at = {rate: float(torch.stack(of_part).square().mean().sqrt()) for rate, of_part in stated.items()}
+    true = {rate: float(torch.stack(of_part).square().mean().sqrt()) for rate, of_part in errors.items()}
     assert true[240] == pytest.approx(true[30], rel=0.2)
     assert at[240] == pytest.approx(at[30], rel=0.2)
     assert at[30] > 0.6 * true[30]
@@ -199,10 +206,10 @@ def test_steps_within_bounds_are_the_best_ones():
     for rows, right, most in quadratics():
         matrix, pull = rows.mT @ rows, rows.mT @ right
         height = lambda s, m=matrix, p=pull: float(0.5 * s @ m @ s - p @ s)  # noqa: E731
-        found = solve_box_qp(matrix, pull, -most, most)
+        result = solve_box_qp(matrix, pull, -most, most)
         best = scipy.optimize.lsq_linear(rows.numpy(), right.numpy(), (-most.numpy(), most.numpy()), "bvls").x
-        assert bool((found.abs() <= most).all())
-        assert height(found) == pytest.approx(height(torch.tensor(best)), rel=1e-9)
+        assert bool((result.abs() <= most).all())
+        assert height(result) == pytest.approx(height(torch.tensor(best)), rel=1e-9)
         uphill += height(torch.linalg.solve(matrix, pull).clamp(-most, most)) > 0
     assert uphill > 10
 
@@ -221,9 +228,9 @@ def test_an_amplitude_at_zero_stays_there_while_others_move():
     low, high = torch.full((2, 6), 1e6, dtype=torch.float64)
     free = torch.linalg.solve(matrix, pull)
     low[0], high[0] = (0.0, high[0]) if free[0] < 0 else (low[0], 0.0)
-    found = solve_box_qp(matrix, pull, -low, high)
-    assert found[0] == 0.0
-    torch.testing.assert_close(found[1:], torch.linalg.solve(matrix[1:, 1:], pull[1:]))
+    result = solve_box_qp(matrix, pull, -low, high)
+    assert result[0] == 0.0
+    torch.testing.assert_close(result[1:], torch.linalg.solve(matrix[1:, 1:], pull[1:]))
 
 
 def test_unknowns_do_not_wait_for_one_that_may_go_no_farther():
@@ -388,12 +395,17 @@ def test_what_was_not_seen_is_no_observation():
     """Pieces of the rim that no camera saw are rows of zeros: fifty made the errors of four rows half as large."""
     toy, jacobian = linear(0)
     for few in (slice(0, 8), slice(None)):
-        own = Linearised(toy.data[few], jacobian[few], torch.ones(len(toy.data[few])), toy.frame[few], toy.patch[few])
-        unseen = Linearised(
-            *(row.new_zeros(50, *row.shape[1:]) for row in own[:2]), torch.ones(50), *(toy.frame[:50], toy.patch[:50])
+        of_part = Linearised(
+            toy.data[few], jacobian[few], torch.ones(len(toy.data[few])), toy.frame[few], toy.patch[few]
         )
-        both = Linearised(*(torch.cat(rows) for rows in zip(own[:5], unseen[:5], strict=True)))
+        unseen = Linearised(
+            *(row.new_zeros(50, *row.shape[1:]) for row in of_part[:2]),
+            torch.ones(50),
+            *(toy.frame[:50], toy.patch[:50]),
+        )
+        both = Linearised(*(torch.cat(rows) for rows in zip(of_part[:5], unseen[:5], strict=True)))
         alone, among = (
-            covariance(toy.problem(), levenberg_marquardt.evaluate_point(toy.problem(), TRUE, rows)) for rows in (own, both)
+            covariance(toy.problem(), levenberg_marquardt.evaluate_point(toy.problem(), TRUE, rows))
+            for rows in (of_part, both)
         )
         torch.testing.assert_close(alone, among, rtol=1e-12, atol=0.0)

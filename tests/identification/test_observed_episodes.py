@@ -12,8 +12,8 @@ from helpers.twins import at, shifted
 import torchcloth as tc
 from torchcloth import recordings as rec
 from torchcloth.episodes import streams
-from torchcloth.episodes.observed import find_depth_camera, compute_initial_vertices, build_mesh
-from torchcloth.episodes.unknowns import find_scalar_parameters, collect_unknowns
+from torchcloth.episodes.observed import build_mesh, compute_initial_vertices, find_depth_camera
+from torchcloth.episodes.unknowns import collect_unknowns, find_scalar_parameters
 from torchcloth.errors import InvalidInput, RecordingError
 from torchcloth.identification import build_cloth, build_episode, identify
 from torchcloth.identification.estimators.objective import Objective
@@ -59,10 +59,10 @@ def test_patches_end_where_they_are_said_to_and_the_first_shape_is_carried_there
     bent = lambda uv: np.column_stack([uv, 0.2 + uv[:, 0] ** 2 - 2 * uv[:, 0] * uv[:, 1]])  # noqa: E731
     given = with_cloth(recording, initial_vertices=bent(recording.cloth.uv))
     for radius in (0.036, 0.045):
-        held = replace(given, grasps={**given.grasps, "left": rec.GraspInfo(corner, radius)})
-        cloth = build_cloth(held)
+        gripped = replace(given, grasps={**given.grasps, "left": rec.GraspInfo(corner, radius)})
+        cloth = build_cloth(gripped)
         fine = refine_cloth(cloth)
-        for model, episode_ in ((cloth, held), (fine, refine_recording(held, cloth.mesh, fine.mesh))):
+        for model, episode_ in ((cloth, gripped), (fine, refine_recording(gripped, cloth.mesh, fine.mesh))):
             uv = model.mesh.uv
             mine = uv[model.boundaries["left"].index.numpy()]
             assert mine[mine[:, 1] == 0, 0].max() == pytest.approx(radius, rel=1e-9)
@@ -168,7 +168,9 @@ def test_a_gripper_without_a_grasp_says_so(recording, model):
     (doubt,) = build_episode(model, replace(recording, grippers={**recording.grippers, "third": hand})).data_warnings()
     assert "no grasp is called third" in doubt
     away = replace(hand, closed=np.zeros_like(hand.closed))
-    assert build_episode(model, replace(recording, grippers={**recording.grippers, "third": away})).data_warnings() == []
+    assert (
+        build_episode(model, replace(recording, grippers={**recording.grippers, "third": away})).data_warnings() == []
+    )
 
 
 def test_until_keeps_the_early_frames(recording, model):
@@ -226,7 +228,9 @@ def test_a_gripper_that_comes_for_the_cloth_later_may_be_far_away(recording):
     }
     build_episode(model, replace(recording, grippers=away))
     with pytest.raises(InvalidInput, match=r"the held patch 0\.5\d m from its gripper"):
-        build_episode(model, replace(recording, grippers={n: replace(g, closed=g.closed | True) for n, g in away.items()}))
+        build_episode(
+            model, replace(recording, grippers={n: replace(g, closed=g.closed | True) for n, g in away.items()})
+        )
 
 
 def test_a_collider_becomes_a_plane(recording):
@@ -241,9 +245,9 @@ def test_a_step_is_half_of_what_is_typical_with_a_sign_and_without():
     mesh = tc.meshes.rectangle(0.1, 0.1, resolution=(3, 3))
     effects = {"rest": tc.effects.RestShape(shrink_warp=0.0), "air": tc.effects.AirDrag(1.0)}
     cloth = tc.Cloth(mesh, tc.materials.AEP(1e5), 0.2, effects, contact=None)
-    found = collect_unknowns(cloth, ["rest.shrink_warp", "air.normal", "youngs_modulus"], None)
-    assert [u.max_step / u.typical_change for u in found] == [0.5, 0.5, 1.0]
-    assert found[0].max_step == pytest.approx(0.01)
+    result = collect_unknowns(cloth, ["rest.shrink_warp", "air.normal", "youngs_modulus"], None)
+    assert [u.max_step / u.typical_change for u in result] == [0.5, 0.5, 1.0]
+    assert result[0].max_step == pytest.approx(0.01)
 
 
 def test_unknowns_by_public_name(model):
@@ -265,7 +269,9 @@ def test_slopes_are_those_of_the_values(model):
 
 
 def test_values_and_raw_are_inverse(model, recording):
-    problem = Objective(model, collect_unknowns(model, ["youngs_modulus", "poisson_ratio"], None), [build_episode(model, recording)])
+    problem = Objective(
+        model, collect_unknowns(model, ["youngs_modulus", "poisson_ratio"], None), [build_episode(model, recording)]
+    )
     values = {"youngs_modulus": 3.3e4, "poisson_ratio": 0.31}
     assert problem.physical_values(problem.start_with(values)) == pytest.approx(values)
 
@@ -363,7 +369,7 @@ def test_the_frame_of_a_time_is_the_nearest_one_that_is_the_same():
 
 
 def test_an_arm_that_stands_by_need_not_be_known(recording, model):
-    beside = replace(recording, joints={"spare": rec.JointMotion(np.arange(5) / 10, np.zeros((5, 6)))})
-    seen, alone = (build_episode(model, r) for r in (beside, recording))
+    aside = replace(recording, joints={"spare": rec.JointMotion(np.arange(5) / 10, np.zeros((5, 6)))})
+    seen, alone = (build_episode(model, r) for r in (aside, recording))
     assert set(seen.motion) == {"left", "right"}
     assert torch.equal(seen.motion["left"].pose, alone.motion["left"].pose)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from torchcloth.episodes.pattern_interpolation import interpolation_weights, interpolate_on_pattern
+from torchcloth.episodes.pattern_interpolation import interpolate_on_pattern, interpolation_weights
 from torchcloth.errors import InvalidInput
 from torchcloth.meshes import Mesh, rectangle
 
@@ -23,9 +23,12 @@ def test_quadratics_come_out_everywhere(crooked):
     uv = mesh.uv + crooked * RNG.uniform(-1, 1, mesh.uv.shape) * inside[:, None]
     mesh = Mesh.build(np.c_[uv, np.zeros(len(uv))], mesh.faces, uv)
     places = RNG.random((200, 2)) * [0.3, 0.2]
-    found = interpolate_on_pattern(interpolation_weights(mesh, places), torch.as_tensor(np.stack([quadratic(uv), uv[:, 0]], 1)).expand(2, 3, -1, -1))
-    assert found.shape == (2, 3, 200, 2)
-    np.testing.assert_allclose(found[1, 2].T, [quadratic(places), places[:, 0]], atol=1e-8)
+    result = interpolate_on_pattern(
+        interpolation_weights(mesh, places),
+        torch.as_tensor(np.stack([quadratic(uv), uv[:, 0]], 1)).expand(2, 3, -1, -1),
+    )
+    assert result.shape == (2, 3, 200, 2)
+    np.testing.assert_allclose(result[1, 2].T, [quadratic(places), places[:, 0]], atol=1e-8)
 
 
 def test_many_vertices_cost_little():
@@ -35,8 +38,8 @@ def test_many_vertices_cost_little():
     weights = interpolation_weights(mesh, places)
     moved = (places != mesh.uv).any(1).sum()
     assert 0 < moved < 40
-    found = weights.to_dense()[(places == mesh.uv).all(1)]
-    assert int((found.abs() > 1e-9).sum()) == len(mesh.uv) - moved
+    result = weights.to_dense()[(places == mesh.uv).all(1)]
+    assert int((result.abs() > 1e-9).sum()) == len(mesh.uv) - moved
 
 
 def test_vertices_are_what_they_are():

@@ -9,7 +9,12 @@ from torch import Tensor
 
 import torchcloth as tc
 from torchcloth.episodes.observed import Episode
-from torchcloth.episodes.observed_surface import error_group_at, build_rim, compute_pattern_fractions, build_surface_of_mesh
+from torchcloth.episodes.observed_surface import (
+    build_rim,
+    build_surface_of_mesh,
+    compute_pattern_fractions,
+    error_group_at,
+)
 from torchcloth.identification.residuals.metrics import HUBER_THRESHOLD, distance_metrics, huber, noise_scale
 from torchcloth.identification.residuals.rigid_carry import carry_rigidly
 from torchcloth.identification.uncertainty.richardson import refine_cloth
@@ -94,7 +99,9 @@ def test_parts_and_rim_are_the_same_on_a_finer_mesh(side, resolution, patterned)
     inside = torch.tensor([0.6, 0.3, 0.1]).expand(len(a), 3)
     place = (inside[:, :, None] * torch.as_tensor(coarse.vertices)[torch.stack([a, b, c], 1)].to(inside)).sum(1)
     every = (4 * place[:, :2] / side).long()
-    assert torch.equal(build_surface_of_mesh(coarse).error_groups_at(torch.stack([a, b, c], 1), inside), 4 * every[:, 0] + every[:, 1])
+    assert torch.equal(
+        build_surface_of_mesh(coarse).error_groups_at(torch.stack([a, b, c], 1), inside), 4 * every[:, 0] + every[:, 1]
+    )
     length = side / 10
     middles = []
     for mesh in (coarse, fine):
