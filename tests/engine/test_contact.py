@@ -161,13 +161,13 @@ def test_recomputed_substeps_are_bitwise_the_recorded_ones():
     cloth, state = folded(tc.Contact(spacing=SPACING))
     with torch.no_grad():
         job = fused.FusedEngine(cloth.build_model(), state, {}).job(state, torch.full((120,), 5e-5), {})
-    results = []
+    adjoints = []
     for every in (1, 7, 120):
         results, records = execution.forward(job, every)
         seeds = {f: noise(t.shape, k, t.dtype) for k, (f, t) in enumerate(results.items())}
-        results.append(execution.reverse(job, records, every, seeds, set(job.inputs)))
-    for other in results[1:]:
-        assert all(torch.equal(value, other[f]) for f, value in results[0].items())
+        adjoints.append(execution.reverse(job, records, every, seeds, set(job.inputs)))
+    for other in adjoints[1:]:
+        assert all(torch.equal(value, other[f]) for f, value in adjoints[0].items())
 
 
 @pytest.fixture

@@ -213,6 +213,6 @@ def test_a_portable_library_serves_without_a_compiler_only(small, monkeypatch):
     monkeypatch.delenv("CXX", raising=False)
     assert library.status() == f"portable: {portable}"
     loaded = []
-    monkeypatch.setattr(library, "_loaded", lambda file: loaded.append(file) or file.stat())
-    library._found.__wrapped__()
+    monkeypatch.setattr(library, "_load", lambda file: loaded.append(file) or file.stat())
+    library._load_once.__wrapped__()
     assert loaded[-1] == portable

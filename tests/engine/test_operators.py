@@ -69,16 +69,16 @@ def test_fakes_have_the_real_shapes(call):
 def test_gradients_by_autograd_of_the_operator_and_of_the_function(call):
     """With records, with coarse ones, and with none, where the adjoint goes through the substeps itself."""
     known, inputs = call
-    results = []
+    gradients = []
     for run in (ops.rollout, lambda n, k, e, values: Rollout.apply(n, k, e, *values)):
         for every in (1, 2, 0):
             mine = leaves(inputs)
             *results, _ = run(known.number, STEPS, every, mine)
             torch.manual_seed(0)
             loss = sum((r * torch.randn_like(r)).sum() for r in results)
-            results.append(torch.autograd.grad(loss, mine))
-    for other in results[1:]:
-        for a, b in zip(results[0], other, strict=True):
+            gradients.append(torch.autograd.grad(loss, mine))
+    for other in gradients[1:]:
+        for a, b in zip(gradients[0], other, strict=True):
             torch.testing.assert_close(a, b)
 
 
