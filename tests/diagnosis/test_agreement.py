@@ -74,7 +74,7 @@ def test_one_motion_agrees_with_nothing():
 
 
 def test_the_numbers_are_those_of_students_distribution():
-    for k, (sure, of_best) in enumerate(
+    for k, (single, of_best) in enumerate(
         zip(CRITERIA.candidate.t_quantiles, CRITERIA.candidate.t_quantiles_best_of_four, strict=True), 1
     ):
         assert single == pytest.approx(t.ppf(0.975, k), abs=0.006)

@@ -148,7 +148,7 @@ def test_a_twin_takes_over_what_the_parameter_did():
 
 def test_amplitudes_stop_where_a_world_ends():
     model = toys.fitted(toys.evidence(toys.smooth(1, 2), 1, [], TRUTH, 0)).model
-    ortho = toys.hypothesis("elas.ortho", high=0.9)
+    ortho = toys.hypothesis("elas.ortho", max_amplitude=0.9)
     assert model.with_hypothesis(ortho).at_point(torch.tensor([0.1, 1.5]).double()).amplitudes == (0.9,)
     plain = replace(ortho, signed=False, min_amplitude=0.1)
     assert model.with_hypothesis(plain).at_point(torch.tensor([0.1, -1.5]).double()).amplitudes == (0.1,)

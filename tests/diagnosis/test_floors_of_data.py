@@ -77,8 +77,13 @@ def test_first_shapes_are_off_by_smooth_fields_along_the_normal_there_and_back()
     edges = torch.as_tensor(topology.find_edges(model.base.cloth.mesh.faces)[0])
     for field in (off[0], off[2]):
         assert float(field.square().sum(1).mean().sqrt()) == pytest.approx(CRITERIA.bifurcation.initial_shape_rms_m)
-        assert float(field[:, 1].square().mean().sqrt()) == pytest.approx(CRITERIA.bifurcation.initial_shape_rms_m, rel=0.01)  # the sheet hangs in x and z
-        assert float((field[edges[:, 0]] - field[edges[:, 1]]).square().sum(1).mean().sqrt()) < CRITERIA.bifurcation.initial_shape_rms_m
+        assert float(field[:, 1].square().mean().sqrt()) == pytest.approx(
+            CRITERIA.bifurcation.initial_shape_rms_m, rel=0.01
+        )  # the sheet hangs in x and z
+        assert (
+            float((field[edges[:, 0]] - field[edges[:, 1]]).square().sum(1).mean().sqrt())
+            < CRITERIA.bifurcation.initial_shape_rms_m
+        )
 
 
 def test_a_cell_that_does_not_follow_its_slope_is_left_out():

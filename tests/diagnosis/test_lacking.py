@@ -170,8 +170,8 @@ def test_a_cause_is_not_doubted_for_what_was_hardly_less_before(monkeypatch, bef
 
 def snapped(found, at, stretches=8):
     """A row of which one stretch is 20 mm off."""
-    (left, expected), off = found.stretches[at], 4e-4 / stretches
-    more = {**found.stretches, at: (off, expected)}
+    (left, expected), off = found.by_window[at], 4e-4 / stretches
+    more = {**found.by_window, at: (off, expected)}
     return found._replace(left=(found.left**2 - left + off) ** 0.5, stretches=more)
 
 

@@ -98,7 +98,7 @@ def test_a_rival_that_joins_the_model_beside_a_cause_is_none_any_more():
 
 @pytest.mark.parametrize("doubtful", [True, False])
 def test_what_may_matter_is_not_called_adequate(doubtful):
-    told = _decide(SimpleNamespace(scores=[]), [], lacking=False, stable=True, doubtful=doubtful)
+    told = _decide(SimpleNamespace(scores=[]), [], is_inadequate=False, meshes_agree=True, is_doubtful=doubtful)
     assert told == ("inconclusive" if doubtful else "adequate")
 
 
@@ -159,7 +159,7 @@ def test_what_was_brought_along_takes_the_place_of_what_brought_it(monkeypatch, 
     base = WorldModel(None, (), toys.torch.zeros(0), (camera,), (4e-3,))  # type: ignore[arg-type]
     current = SimpleNamespace(model=base.with_hypothesis(wind.hypothesis, left), linearisation=None)
     step = AcceptedCause(wind, None, [wind, drag], [drag], [], None, None)  # type: ignore[arg-type]
-    monkeypatch.setattr(backward_elimination, "remove_cause", lambda found, name: found.model.without(name))
+    monkeypatch.setattr(backward_elimination, "remove_cause", lambda found, name: found.model.without_hypothesis(name))
     monkeypatch.setattr(
         backward_elimination,
         "fit",
@@ -198,7 +198,7 @@ def test_what_cannot_be_simulated_without_a_cause_leaves_it_in(monkeypatch):
     def diverges(*_):
         raise SimulationDiverged("no such world")
 
-    monkeypatch.setattr(backward_elimination, "remove_cause", lambda found, name: found.model.without(name))
+    monkeypatch.setattr(backward_elimination, "remove_cause", lambda found, name: found.model.without_hypothesis(name))
     monkeypatch.setattr(backward_elimination, "accept", lambda *_, **__: False)
     monkeypatch.setattr(backward_elimination, "fit", diverges)
     asked = (SimpleNamespace(motions=[]), [], lambda _: None)

@@ -19,11 +19,11 @@ def test_what_a_parameter_does_already_has_its_slopes(made):
     model, setting = made
     by, place = {h.name: h for h in list_hypotheses(model, [RECORDING])}, [p.name for p in model.parameters]
     there = model.at(torch.full_like(model.point, 0.1))
-    asked = [by["mass.log_density"], by["air.drag_n"]]
+    asked = [by["mass.density"], by["air.drag_n"]]
     at_once, before = linearise(there, setting, asked), linearise(there, setting)
     later = linearise_hypotheses(before, there, setting, asked)
     for found in (at_once, later):
-        assert [h.name for h in found.hypotheses] == ["air.drag_n", "mass.log_density"]
+        assert [h.name for h in found.hypotheses] == ["air.drag_n", "mass.density"]
         slopes = found.bins[0].jacobian
         own = slopes[:, place.index("areal_density")]
         torch.testing.assert_close(
