@@ -51,7 +51,7 @@ def test_twist_may_differ_in_a_batch(engine):
 
 
 @ENGINES
-@pytest.mark.parametrize(("made", "own"), [(torch.float64, torch.float32), (torch.float32, torch.float64)])
+@pytest.mark.parametrize(("made", "parameter"), [(torch.float64, torch.float32), (torch.float32, torch.float64)])
 def test_parts_take_the_precision_of_the_cloth(engine, made, parameter):
     before = torch.get_default_dtype()
     try:

@@ -259,7 +259,7 @@ def test_large_cells_of_an_uneven_mesh_have_no_holes(cell):
     assert float(end.min()) > 0.01
 
 
-@pytest.mark.parametrize(("contact", "told"), [(tc.Contact(), True), (tc.Contact.with_gap(0.01), False)])
+@pytest.mark.parametrize(("contact", "reported"), [(tc.Contact(), True), (tc.Contact.with_gap(0.01), False)])
 def test_layers_that_do_not_meet_are_told(contact, reported):
     """A shirt on a grid as coarse as its mesh: the way round its seams is too short for the layers to be any."""
     mesh = tc.meshes.shirt(triangles=2000 if not reported else 300)
