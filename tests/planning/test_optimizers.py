@@ -21,7 +21,8 @@ class Bowl:
 
     def __init__(self, bound=10.0, blocked=lambda at: False, diverges=lambda at: False):
         high = torch.full((2,), bound)
-        self.bounds = LinearBounds(torch.eye(2), -high, high, ["x", "y"])
+        groups = torch.arange(2)
+        self.bounds = LinearBounds(torch.eye(2), -high, high, ["x", "y"], groups, groups)
         self.blocked, self.diverges, self.seen = blocked, diverges, []
 
     def evaluate(self, at):

@@ -50,7 +50,7 @@ MIN_LEVEL_TABLE_COSINE = 0.9999  # cosine of a table's slope; below it the table
 def extract_motion_parameters(
     cloth: Cloth, recording: Recording, waypoints: int, wait: float, acceleration: float, limits: GripperLimits
 ) -> list[GripperMotionParameters]:
-    """Extract the parametrised motion of recorded_paths gripper that holds the cloth.
+    """Extract the parametrised motion of every gripper that holds the cloth.
 
     A motion spans the time from the first frame to the end of the recording and a wait after it. A gripper that is
     under way coordinates the end comes to rest in the wait.

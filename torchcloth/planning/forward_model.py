@@ -60,9 +60,7 @@ class ForwardModel:
             self._first = self._commanded({m.name: m.trajectory(m.zero_waypoints) for m in motions})
             driven = self.world.apply_motion(self._first)
             state = self.world.cloth.state(driven.initial)
-            if (
-                driven.needs_settling
-            ):  # no_points is added to where grippers are at first, so it is the same under all motions
+            if driven.needs_settling:  # all motions start at the recorded pose, so the settled state is the same
                 state = self.world.cloth.settle(state, driven.motion, start=span.begin, duration=SETTLE_TIME_S)
             self.state = state
 
