@@ -14,7 +14,7 @@ import xml.etree.ElementTree as ET
 from pathlib import Path
 from typing import NamedTuple
 
-HEADER = """<?xml version="1.0"?>
+URDF_HEADER = """<?xml version="1.0"?>
 <!-- Author: torchcloth. Licence: Apache-2.0. Written by generate.py; edit that file, not this one.
      Flexiv {model}, {wrist}.
      Figures: flexiv_rdk @ ab70315, flexiv_ros2 @ 9d96a86 and flexiv_description 2.0 (Apache-2.0); see generate.py.
@@ -42,26 +42,25 @@ class Variant(NamedTuple):
 NEW_WRIST = ("wrist generation 2024 (files dated 2024-03-29 and later)", (-0.015, 0.073, 0.110), -1.5707963478683205)
 OLD_WRIST = ("wrist generation 2022 (files dated 2022-08 to 2024-03)", (-0.055, 0.070, 0.110), -1.5707963267948966)
 
-VARIANTS = {
+RIZON_VARIANTS = {
     "rizon4": Variant("Rizon 4", *NEW_WRIST, 0.1055, 0.081, 0.8, 0.03),
     "rizon4_gen2022": Variant("Rizon 4", *OLD_WRIST, 0.072, 0.081, 0.8, 0.03),
     "rizon4s": Variant("Rizon 4s", *NEW_WRIST, 0.1055, 0.124, 1.4, 0.05),
 }
 
-PI = math.pi
 # xyz, yaw, axis, hard limits, velocity (rad/s), effort (N m); joint 7 is completed by the variant.
-JOINTS = [
-    ((0, 0, 0.155), -PI, "0 0 1", (-2.8798, 2.8798), (-2.7925, 2.7925), 2.0944, 123),
+RIZON_JOINT_TABLE = [
+    ((0, 0, 0.155), -math.pi, "0 0 1", (-2.8798, 2.8798), (-2.7925, 2.7925), 2.0944, 123),
     ((0, 0.030, 0.210), 0, "0 1 0", (-2.3562, 2.3562), (-2.2689, 2.2689), 2.0944, 123),
     ((0, 0.035, 0.205), 0, "0 0 1", (-3.0543, 3.0543), (-2.9671, 2.9671), 2.4435, 64),
-    ((-0.020, -0.030, 0.190), -PI, "0 1 0", (-1.9548, 2.7751), (-1.8675, 2.6878), 2.4435, 64),
-    ((-0.020, 0.025, 0.195), -PI, "0 0 1", (-3.0543, 3.0543), (-2.9671, 2.9671), 4.8869, 39),
+    ((-0.020, -0.030, 0.190), -math.pi, "0 1 0", (-1.9548, 2.7751), (-1.8675, 2.6878), 2.4435, 64),
+    ((-0.020, 0.025, 0.195), -math.pi, "0 0 1", (-3.0543, 3.0543), (-2.9671, 2.9671), 4.8869, 39),
     ((0, 0.030, 0.190), 0, "0 1 0", (-1.4835, 4.6251), (-1.3963, 4.5379), 4.8869, 39),
     (None, 0, "0 0 1", (-3.0543, 3.0543), (-2.9671, 2.9671), 4.8869, 39),
 ]
 
 # mass, centre of mass, (ixx, iyy, izz, ixy, ixz, iyz) about it; link 7 is completed by the variant.
-INERTIALS = {
+LINK_INERTIALS = {
     "base_link": (3.8, (0, 0, 0.09), (0.02, 0.02, 0.01, 0, 0, 0)),
     "link1": (3.6, (0, 0, 0.15), (0.03, 0.03, 0.01, 0, 0, 0)),
     "link2": (2.7, (0, 0.04, 0.10), (0.02, 0.02, 0.004, 0, 0, -0.0003)),
@@ -73,7 +72,7 @@ INERTIALS = {
 }
 
 # Cylinders as (radius, start, end); links 6 and 7 are completed by the variant.
-CYLINDERS = {
+LINK_CYLINDERS = {
     "base_link": [(0.0825, (0, 0, 0), (0, 0, 0.150))],
     "link1": [(0.0615, (0, 0, 0), (0, 0, 0.2715))],
     "link2": [(0.0615, (0, -0.015, 0), (0, 0.089, 0)), (0.055, (0, 0.035, 0), (0, 0.035, 0.200))],
@@ -83,7 +82,7 @@ CYLINDERS = {
 }
 
 # Boxes as (size, centre): the gripper's body, and its two closed finger tips as one.
-BOXES = {
+LINK_BOXES = {
     "grav_base_link": [((0.088, 0.096, 0.1165), (0, 0, 0.05625))],
     "tcp_closed": [((0.0148, 0.040, 0.038), (0, 0, -0.019))],
 }
@@ -112,7 +111,7 @@ def add_link(robot: ET.Element, name: str, inertials: dict, cylinders: dict) -> 
     for tag in ("visual", "collision"):
         for radius, start, end in cylinders.get(name, ()):
             add_cylinder(ET.SubElement(link, tag), radius, start, end)
-        for size, centre in BOXES.get(name, ()):
+        for size, centre in LINK_BOXES.get(name, ()):
             shape = ET.SubElement(link, tag)
             add_origin(shape, centre)
             ET.SubElement(ET.SubElement(shape, "geometry"), "box", size=text(*size))
@@ -139,7 +138,7 @@ def add_joint(robot: ET.Element, name: str, kind: str, parent: str, child: str, 
 
 def add_arm_joint(robot: ET.Element, number: int, variant: Variant) -> None:
     """Appends ``joint<number>`` with its axis and its hard and soft limits."""
-    xyz, yaw, axis, hard, soft, velocity, effort = JOINTS[number - 1]
+    xyz, yaw, axis, hard, soft, velocity, effort = RIZON_JOINT_TABLE[number - 1]
     pitch = 0.0 if xyz else variant.joint7_pitch
     parent = "base_link" if number == 1 else f"link{number - 1}"
     origin = xyz or variant.joint7_xyz
@@ -152,17 +151,17 @@ def add_arm_joint(robot: ET.Element, number: int, variant: Variant) -> None:
 
 
 def render(name: str) -> str:
-    """The URDF text of one of ``VARIANTS``."""
-    variant = VARIANTS[name]
+    """The URDF text of one of ``RIZON_VARIANTS``."""
+    variant = RIZON_VARIANTS[name]
     link7 = (variant.link7_mass, (0, 0, variant.link7_com), (0.001, 0.001, 0.001, 0, 0, 0))
-    inertials = INERTIALS | {"link7": link7}
+    inertials = LINK_INERTIALS | {"link7": link7}
     bend = variant.joint7_xyz[1]  # link 6 runs along y, then z, then x, as far from its start as joint 7 is
     elbow = [
         (0.050, (0, 0, 0), (0, 0.080, 0)),
         (0.050, (0, bend, 0), (0, bend, 0.110)),
         (0.050, (variant.joint7_xyz[0], bend, 0.110), (variant.link6_reach, bend, 0.110)),
     ]
-    cylinders = CYLINDERS | {"link6": elbow, "link7": [(0.050, (0, 0, 0), (0, 0, variant.link7_length))]}
+    cylinders = LINK_CYLINDERS | {"link6": elbow, "link7": [(0.050, (0, 0, 0), (0, 0, variant.link7_length))]}
 
     robot = ET.Element("robot", name=name)
     arm = ["base_link", *(f"link{number}" for number in range(1, 8))]
@@ -170,14 +169,14 @@ def render(name: str) -> str:
         add_link(robot, link, inertials, cylinders)
     for number in range(1, 8):
         add_arm_joint(robot, number, variant)
-    add_joint(robot, "link7_to_flange", "fixed", "link7", "flange", (0, 0, variant.link7_length), (0, 0, -PI))
+    add_joint(robot, "link7_to_flange", "fixed", "link7", "flange", (0, 0, variant.link7_length), (0, 0, -math.pi))
     add_joint(robot, "flange_to_grav", "fixed", "flange", "grav_base_link", (0, 0, 0), (0, 0, 0))
     add_joint(robot, "grav_to_tcp_open", "fixed", "grav_base_link", "tcp_open", (0, 0, 0.150), (0, 0, 0))
     add_joint(robot, "grav_to_tcp_closed", "fixed", "grav_base_link", "tcp_closed", (0, 0, 0.200), (0, 0, 0))
     ET.indent(robot)
-    return HEADER.format(model=variant.model, wrist=variant.wrist) + ET.tostring(robot, encoding="unicode") + "\n"
+    return URDF_HEADER.format(model=variant.model, wrist=variant.wrist) + ET.tostring(robot, encoding="unicode") + "\n"
 
 
 if __name__ == "__main__":
-    for name in VARIANTS:
+    for name in RIZON_VARIANTS:
         (Path(__file__).parent / f"{name}.urdf").write_text(render(name))

@@ -61,7 +61,10 @@ def test_texture_coordinates_are_no_pattern(episode):
     """From 0 to 1 on a sheet of 0.3 m x 0.2 m: where episode.json gives no sheet, nothing else tells their unit."""
     edit_json(episode, ["cloth", "sheet"], DROP)
     mesh = episode / "cloth.obj"
-    unit = lambda row: f"vt {float(row[1]) / 0.3!r} {float(row[2]) / 0.2!r}"  # noqa: E731
+
+    def unit(row):
+        return f"vt {float(row[1]) / 0.3!r} {float(row[2]) / 0.2!r}"
+
     mesh.write_text(re.sub(r"vt (\S+) (\S+)", unit, mesh.read_text()))
     refused(episode, r"cloth.obj: vt; got edges .* 3.33 to 5 times .*; expected about the same; vt must be in metres")
 

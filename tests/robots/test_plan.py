@@ -190,7 +190,10 @@ def test_solids_keep_their_distance(rig, made, family):
 
 def test_points_know_solids_that_cross():
     """What the test above relies on: two bars that cross in their middles have no corner near each other."""
-    bar = lambda *size: Primitive("box", size, torch.eye(4, dtype=torch.float64).expand(1, 4, 4), "bar")  # noqa: E731
+
+    def bar(*size):
+        return Primitive("box", size, torch.eye(4, dtype=torch.float64).expand(1, 4, 4), "bar")
+
     one, other = bar(0.4, 0.02, 0.02), bar(0.02, 0.4, 0.02)
     assert float(_outside(other, _points(one)).min()) < 0
     post = other._replace(kind="cylinder", size=(0.01, 0.4))
@@ -200,7 +203,10 @@ def test_points_know_solids_that_cross():
 
 def _points(p, apart=0.01):
     """[T, N, 3] on the surface of a box or cylinder, about ``apart`` m from each other."""
-    line = lambda length: torch.linspace(-0.5, 0.5, 2 + int(length / apart), dtype=torch.float64) * length  # noqa: E731
+
+    def line(length):
+        return torch.linspace(-0.5, 0.5, 2 + int(length / apart), dtype=torch.float64) * length
+
     if p.kind == "box":
         x, y, z = map(line, p.size)
         local = torch.cartesian_prod(x, y, z)
@@ -210,7 +216,10 @@ def _points(p, apart=0.01):
         radius, length = p.size
         angle = torch.linspace(0, 2 * math.pi, 2 + int(2 * math.pi * radius / apart), dtype=torch.float64)[:-1]
         circle = torch.stack([angle.cos(), angle.sin()], -1)
-        at = lambda r, z: torch.cat([r * circle, torch.full((len(angle), 1), float(z))], -1)  # noqa: E731
+
+        def at(r, z):
+            return torch.cat([r * circle, torch.full((len(angle), 1), float(z))], -1)
+
         ends = [at(r, z) for r in torch.arange(0, radius, apart) for z in (-length / 2, length / 2)]
         local = torch.cat([*ends, *(at(radius, z) for z in line(length))])
     return (p.pose[:, None, :3, :3] @ local[None, :, :, None])[..., 0] + p.pose[:, None, :3, 3]

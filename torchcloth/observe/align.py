@@ -23,12 +23,12 @@ VISIBILITY_UPDATE_INTERVAL = 5  # iterations between two updates of the visible 
 OUTLINE_RADIUS_M = (0.06, 0.01)  # in the first and last iteration; parts of the rim farther from points are hidden
 MAX_ALIGNMENT_POINTS = 1000
 COARSE_ALIGNMENT_POINTS = 250  # in all but the last iterations
-MIN_CLOUD_POINTS = 20
+MIN_ALIGNMENT_POINTS = 20
 MAX_RAY_TRIANGLE_PAIRS = 400_000  # per pass
 MAX_DISTANCES_PER_PASS = 4_000_000
 MAX_CLOUD_EXTENT_RATIO = 1.2  # extent of a cloud over that of the cloth
 MIN_OCCLUDER_GAP_M = 1e-3  # an occluder is nearer to the camera by at least this
-HUBER_THRESHOLD = 2.5  # standard deviations beyond which a point counts linearly
+POINT_HUBER_THRESHOLD = 2.5  # standard deviations beyond which a point counts linearly
 GOOD_RMS_RATIO = 1.5  # rms distance over noise, below which no other pose is tried
 MAX_RMS_RATIO = 4.0  # rms distance over noise, above which the alignment is refused
 MAX_EDGE_STRAIN = 0.15
@@ -137,7 +137,7 @@ def _surface_equations(x: Tensor, points: Tensor, faces: Tensor, noise: float) -
     ):
         z = value / noise
         linear = Equations(corners, weights.unsqueeze(-1) * direction.unsqueeze(1) / noise, z)
-        equations.append(linear.weighted(HUBER_THRESHOLD / z.abs().clamp_min(HUBER_THRESHOLD)))
+        equations.append(linear.weighted(POINT_HUBER_THRESHOLD / z.abs().clamp_min(POINT_HUBER_THRESHOLD)))
     return equations
 
 
@@ -262,8 +262,8 @@ def _validate_inputs(mesh: Mesh, cloud, start, noise: float, strain: float) -> t
             raise InvalidInput(name, got=f"shape {tuple(value.shape)}", expected="finite [N, 3] in metres")
     if len(x) != len(mesh.vertices):
         raise InvalidInput("start", got=f"{len(x)} rows", expected=f"{len(mesh.vertices)}, one per vertex")
-    if len(points) < MIN_CLOUD_POINTS:
-        raise InvalidInput("cloud", got=f"{len(points)} points", expected=f"at least {MIN_CLOUD_POINTS}")
+    if len(points) < MIN_ALIGNMENT_POINTS:
+        raise InvalidInput("cloud", got=f"{len(points)} points", expected=f"at least {MIN_ALIGNMENT_POINTS}")
     _check_size(mesh, points)
     for name, value in (("noise", noise), ("strain", strain)):
         if not (np.isfinite(value) and value > 0):

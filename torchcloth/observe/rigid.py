@@ -1,4 +1,4 @@
-"""Rigid registration of a mesh to a point cloud from scoring_sample starts, by iterated closest points (ICP)."""
+"""Rigid registration of a mesh to a point cloud from many starts, by iterated closest points (ICP)."""
 
 from __future__ import annotations
 

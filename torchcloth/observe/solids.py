@@ -11,7 +11,7 @@ from ..errors import InvalidInput
 
 Array = np.ndarray
 
-_BOX = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)])
+_BOX_CORNERS = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)])
 _BOX_FACES = np.array(
     [0, 1, 3, 0, 3, 2, 4, 6, 7, 4, 7, 5, 0, 4, 5, 0, 5, 1, 2, 3, 7, 2, 7, 6, 0, 2, 6, 0, 6, 4, 1, 5, 7, 1, 7, 3]
 ).reshape(-1, 3)
@@ -71,7 +71,7 @@ def build_solid_mesh(kind: str, size: tuple[float, ...], pose: Array, segments: 
             "size", got=size, expected=f"{size_counts[kind]} positive lengths in m", remedy="segments >= 3"
         )
     if kind == "box":
-        vertices, faces = _BOX * np.asarray(size, float), _BOX_FACES
+        vertices, faces = _BOX_CORNERS * np.asarray(size, float), _BOX_FACES
     else:
         vertices, faces = _revolve(*_outline(kind, size, segments), segments)
     pose = np.asarray(pose, dtype=float)

@@ -22,8 +22,8 @@ ROUNDING_TOLERANCE = 1e-9  # of R R^T or a length, below which the stored value 
 MIN_MISSPELLING_SIMILARITY = 0.8  # of two keys (difflib), above which one of them is a misspelling
 
 
-_KINDS = {"float": ("iuf", np.float64), "int": ("iu", np.int64), "bool": ("b", np.bool_)}
-_NAME = re.compile(r"[^./\\\x00][^/\\\x00]*")
+_DTYPES_BY_KIND = {"float": ("iuf", np.float64), "int": ("iu", np.int64), "bool": ("b", np.bool_)}
+_PLAIN_NAME_PATTERN = re.compile(r"[^./\\\x00][^/\\\x00]*")
 
 P = ParamSpec("P")
 R = TypeVar("R")
@@ -49,7 +49,7 @@ def check_array(
     Raises:
         RecordingError: another shape or type, or numbers that are not finite.
     """
-    letters, dtype = _KINDS[kind]
+    letters, dtype = _DTYPES_BY_KIND[kind]
     try:
         data = np.asarray(value)
     except ValueError as error:
@@ -163,7 +163,7 @@ def check_name(value: str, place: str) -> str:
     Raises:
         RecordingError: it has slashes or begins with a dot.
     """
-    if not _NAME.fullmatch(value):
+    if not _PLAIN_NAME_PATTERN.fullmatch(value):
         expected = "one name without slashes that does not begin with a dot"
         raise RecordingError(f"{place} is not a plain name", got=repr(value), expected=expected, remedy="rename it")
     return value

@@ -22,7 +22,7 @@ ImageKind = Literal["depth", "color", "mask"]
 IMAGE_KINDS: tuple[ImageKind, ...] = ("depth", "color", "mask")
 TIMESTAMPS_FILE = "timestamps.csv"
 PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
-_COLUMNS = ["frame", "t_color", "t_depth"]
+_TIMESTAMP_COLUMNS = ["frame", "t_color", "t_depth"]
 _SUFFIXES: dict[ImageKind, set[str]] = {"depth": {".png"}, "color": {".jpg", ".jpeg", ".png"}, "mask": {".png"}}
 
 
@@ -196,7 +196,7 @@ def format_timestamps(streams: dict[ImageKind, ImageStream]) -> str:
     times = {kind: dict(zip(s.frames.tolist(), s.t.tolist(), strict=True)) for kind, s in streams.items()}
     color, depth = times.get("color", {}), times.get("depth", times.get("mask", {}))
     rows = [f"{n},{color.get(n, '')},{depth.get(n, '')}" for n in sorted(color.keys() | depth.keys())]
-    return "\n".join([",".join(_COLUMNS), *rows]) + "\n"
+    return "\n".join([",".join(_TIMESTAMP_COLUMNS), *rows]) + "\n"
 
 
 def _list(folder: Folder, kind: ImageKind) -> dict[int, Path]:
@@ -221,7 +221,7 @@ def _read_times(folder: Folder) -> tuple[dict[int, float], dict[int, float]]:
     depth: dict[int, float] = {}
     try:
         header, *rows = csv.reader(folder.read_text(TIMESTAMPS_FILE).splitlines())
-        if [cell.strip() for cell in header] != _COLUMNS:
+        if [cell.strip() for cell in header] != _TIMESTAMP_COLUMNS:
             raise ValueError(f"header {header}")
         if len({int(row[0]) for row in rows}) < len(rows):
             raise ValueError("a frame listed twice")
@@ -233,5 +233,7 @@ def _read_times(folder: Folder) -> tuple[dict[int, float], dict[int, float]]:
     except RecordingError:
         raise
     except (ValueError, IndexError, csv.Error) as error:
-        raise RecordingError(f"{place} is damaged", got=error, expected=f"rows of {','.join(_COLUMNS)}") from error
+        raise RecordingError(
+            f"{place} is damaged", got=error, expected=f"rows of {','.join(_TIMESTAMP_COLUMNS)}"
+        ) from error
     return color, depth

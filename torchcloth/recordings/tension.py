@@ -28,7 +28,7 @@ TENSION_FORMAT, TENSION_VERSION = "torchcloth-tension", 1
 TENSION_TABLE_FILE, TENSION_ROWS_FILE = "table.json", "table.csv"
 MAX_SPECIMEN_LENGTH_M = 5.0  # the same number in millimetres is a loop of yarn
 MAX_STRAIN = 5.0  # above it, displacements are not in the unit of the length
-_COLUMNS = ("repeat", "displacement", "force", "lateral_strain")
+_TENSION_COLUMNS = ("repeat", "displacement", "force", "lateral_strain")
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -159,8 +159,8 @@ def _columns(text: str, place: str) -> dict[str, np.ndarray]:
     except csv.Error as error:
         raise RecordingError(f"{place} is not CSV", got=error, remedy="restore or repair it") from error
     head, body = (lines[0], lines[1:]) if lines else ([], [])
-    if not {"displacement", "force"} <= set(head) <= set(_COLUMNS) or len(set(head)) < len(head):
-        raise RecordingError(f"{place} has other columns", got=head, expected=f"some of {', '.join(_COLUMNS)}")
+    if not {"displacement", "force"} <= set(head) <= set(_TENSION_COLUMNS) or len(set(head)) < len(head):
+        raise RecordingError(f"{place} has other columns", got=head, expected=f"some of {', '.join(_TENSION_COLUMNS)}")
     if len(body) < 2:
         raise RecordingError(f"{place} is too short", got=f"{len(body)} row(s)", expected="at least 2")
     for number, row in enumerate(body, 2):
@@ -189,4 +189,4 @@ def _scalars(table: ForceDisplacement) -> dict[str, Any]:
 
 def _arrays(table: ForceDisplacement) -> dict[str, np.ndarray]:
     """Columns that are present, in the file's order."""
-    return {key: np.asarray(getattr(table, key)) for key in _COLUMNS if getattr(table, key) is not None}
+    return {key: np.asarray(getattr(table, key)) for key in _TENSION_COLUMNS if getattr(table, key) is not None}

@@ -107,7 +107,7 @@ class _Bag:
             self.mapping["origin"] = source  # the file that the recording was imported from
 
     def write(self) -> None:
-        """Write streams_by_kind message in the order of time."""
+        """Write every message in the order of time."""
         writing.build_motion_arrays(self.recording)  # checks that pose and joints of a name agree in shared arrays
         with self.bag:
             for name in {**self.recording.grippers, **self.recording.joints}:

@@ -46,7 +46,7 @@ REDWOOD_CAMERA_NAME = "cam0"
 REDWOOD_UNCHECKED = "intrinsics, pose, and pixels of JPEG images"
 REDWOOD_DEPTH_SCALE_M = 0.001
 MAX_PAIR_DELAY_NS = 50_000_000  # between the images of a pair
-_STAMPED = re.compile(r"\d+-(\d{6,15})")
+_STAMPED_NAME_PATTERN = re.compile(r"\d+-(\d{6,15})")
 
 
 def matches(path: Path) -> bool:
@@ -149,7 +149,7 @@ def _images(folder: Path, suffixes: tuple[str, ...]) -> list[Path]:
 
 
 def _times(paths: list[Path], fps: float | None) -> np.ndarray:
-    stamps = [_STAMPED.fullmatch(p.stem) for p in paths]
+    stamps = [_STAMPED_NAME_PATTERN.fullmatch(p.stem) for p in paths]
     if all(stamps):
         return np.array([int(s.group(1)) * 1000 for s in stamps if s])
     if any(stamps):

@@ -113,7 +113,7 @@ class CameraTopics:
             by_time = dict(zip(stamps[image_kind].tolist(), numbers[image_kind].tolist(), strict=True))
             unmatched = [s for s in stamps["mask"].tolist() if s not in by_time]
             if unmatched:
-                expected = f"the time stamp image_kind a {image_kind} image"
+                expected = f"the time stamp of a {image_kind} image"
                 raise RecordingError(
                     f"{self.images['mask']} masks nothing", got=f"{unmatched[0]} ns", expected=expected
                 )
