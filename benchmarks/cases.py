@@ -21,9 +21,9 @@ from torchcloth.training.validation.verification.apic import APICCloth
 SUBSTEP_S = 1.6e-4  # stable in every case
 SUBSTEPS_PER_FRAME = 250  # 25 frames a second
 CELL_SIZE_M = 0.025  # of the standard sheet; also the spacing of its contact grid
-SHEET_SIDE_M = 0.5
+STANDARD_SHEET_SIDE_M = 0.5
 SWING_M, SWING_PERIOD_S = 0.2, 1.0  # of the hands, from one end to the other
-KNOT_INTERVAL_S = 0.02  # between poses of a gripper
+HAND_KNOT_INTERVAL_S = 0.02  # between poses of a gripper
 AREAL_DENSITY_KG_PER_M2 = 0.15
 MATERIAL = {  # a cotton: E h = 609 N/m, and contact as soft as folding needs
     "youngs_modulus": 609e3,
@@ -81,7 +81,7 @@ class Case:
 
     @property
     def triangles(self) -> int:
-        """Count of triangles."""
+        """Number of triangles of the mesh."""
         return len(self.mesh.faces)
 
     @property
@@ -174,7 +174,10 @@ def build_scene(case: Case, engine: str, substeps: int, batch: int = 0) -> Scene
 def gripper_motion(case: Case, substeps: int, dtype: torch.dtype) -> tuple[list[float], dict[str, tc.Trajectory]]:
     """Return frame times that give exactly this many substeps of SUBSTEP_S, and the trajectories."""
     marks = [*range(0, substeps, SUBSTEPS_PER_FRAME), substeps]
-    knots = torch.arange(math.ceil(substeps * SUBSTEP_S / KNOT_INTERVAL_S) + 2, dtype=torch.float64) * KNOT_INTERVAL_S
+    knots = (
+        torch.arange(math.ceil(substeps * SUBSTEP_S / HAND_KNOT_INTERVAL_S) + 2, dtype=torch.float64)
+        * HAND_KNOT_INTERVAL_S
+    )
     shift = case.path.displacement(knots)
     motion = {}
     for name, vertices in case.grips.items():
@@ -232,7 +235,7 @@ def _garment(small: bool) -> Case:
 
 def _standard(name: str, contact: tc.Contact, **options) -> Callable[[bool], Case]:
     return lambda small: _hanging_sheet(
-        name, SMALL_CELLS if small else round(SHEET_SIDE_M / CELL_SIZE_M), contact, **options
+        name, SMALL_CELLS if small else round(STANDARD_SHEET_SIDE_M / CELL_SIZE_M), contact, **options
     )
 
 

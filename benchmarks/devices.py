@@ -44,7 +44,7 @@ MAX_POSITION_DIFFERENCE_M = 1e-3  # in float32; rounding errors grow where cloth
 
 
 def main() -> None:
-    """Print the table."""
+    """Print the table of all paths and devices."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--scenes", type=int, nargs="+", default=[1, 32, 256], metavar="N", help="at a time")
     parser.add_argument(

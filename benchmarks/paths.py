@@ -43,7 +43,7 @@ class Pull(AbstractEffect):
         self.strength = tc.PhysicalParameter(1e-12, "N", "nonnegative", name="pull")
 
     def coefficients(self):
-        """Return its strength."""
+        """Return the strength of the effect."""
         return self.strength.field
 
     def force(self, c, now):
@@ -80,7 +80,7 @@ def seconds(work: Callable[[], T], repeats: int) -> tuple[float, T]:
 
 
 def main() -> None:
-    """Print the table."""
+    """Print the table of all paths."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--frames", type=int, default=6, help="at 30 Hz")
     parser.add_argument("--repeats", type=int, default=3)

@@ -151,7 +151,7 @@ class Bench:
             worker.close()
 
     def run(self) -> None:
-        """Measure all rounds."""
+        """Measure all rounds of all entries."""
         for entries in measurement_rounds(self.plan):
             self.measure(entries)
 

@@ -78,7 +78,7 @@ class Worker:
         self._ask({"forget": {}})
 
     def close(self) -> None:
-        """End the process."""
+        """End the process of the worker."""
         self._signal("SIGCONT")
         with contextlib.suppress(OSError):
             self._process.stdin.close()  # type: ignore[union-attr]

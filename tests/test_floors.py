@@ -47,7 +47,7 @@ ONLY = {
 EXCEPTIONS: dict[tuple[str, str], str] = {}
 
 
-ROOMS_WITH_CIRCLES = ("engine", "training")  # lowering <-> lowerings, cuda.codegen <-> cuda.emit_*; force_terms
+ROOMS_WITH_CIRCLES = ("training",)  # force_terms
 
 
 def floor(room: str) -> int:

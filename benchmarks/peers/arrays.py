@@ -39,7 +39,7 @@ class Law(NamedTuple):
 
 
 def arrays(case: Case, substeps: int) -> Arrays:
-    """Everything that a peer needs of a case."""
+    """Convert a case to the arrays that a peer needs."""
     mesh = case.mesh
     gradient = mesh.shape_gradient
     frame = np.stack([gradient[:, 1, 0], gradient[:, 2, 0], gradient[:, 1, 1], gradient[:, 2, 1]], axis=1)
@@ -61,7 +61,7 @@ def arrays(case: Case, substeps: int) -> Arrays:
 
 
 def law() -> Law:
-    """Plane stress, as torchcloth's default."""
+    """Compute the plane-stress matrix, as torchcloth's default law does."""
     nu, h = MATERIAL["poisson_ratio"], THICKNESS_M
     director = (MATERIAL["contact_stiffness"] * h, MATERIAL["shear_stiffness"] * h, MATERIAL["cone"])
     return Law(h / (2 * (1 + nu)), h * nu / (1 - nu * nu), *director)

@@ -28,7 +28,7 @@ class MuJoCo(Contestant):
         pass
 
     def prepare(self, task: Task):
-        """A model of the scene."""
+        """Build a model of the scene."""
         if task.quantity != "forward" or task.batch:
             raise Unsupported("MuJoCo has no derivatives through a flex but finite differences, and no batches of it")
         case = task.build_case()

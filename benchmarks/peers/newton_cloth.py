@@ -29,7 +29,7 @@ class Newton(Contestant):
 
 @wp.kernel
 def lead(index: wp.array(dtype=int), velocity: wp.array(dtype=wp.vec3), k: int, v: wp.array(dtype=wp.vec3)):
-    """Held particles have no inverse mass: they move as their velocity says."""
+    """Move the held particles. They have no inverse mass: they move as their velocity says."""
     v[index[wp.tid()]] = velocity[k]
 
 
@@ -78,7 +78,7 @@ class Sheet:
         return builder.finalize(device="cpu", requires_grad=grad)
 
     def run(self) -> None:
-        """From the start to the loss."""
+        """Run from the start to the loss."""
         first, count = self.states[0], len(self.states)
         first.particle_q.assign(self.start)
         first.particle_qd.zero_()
@@ -89,7 +89,7 @@ class Sheet:
             self.solver.step(before, after, self.control, None, SUBSTEP_S)
 
     def forward(self) -> Outcome:
-        """Positions at the end."""
+        """Return the positions at the end."""
         self.run()
         return Outcome(self.end())
 
@@ -110,5 +110,5 @@ class Sheet:
         return result
 
     def end(self) -> np.ndarray:
-        """[V, 3] m."""
+        """Return the final positions [V, 3] m."""
         return self.states[self.substeps % len(self.states)].particle_q.numpy() - self.data.shift

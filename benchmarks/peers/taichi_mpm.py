@@ -33,7 +33,7 @@ class Taichi(Contestant):
 
 @ti.func
 def gradient_of(w: ti.template(), d: ti.template(), i: ti.template(), j: ti.template(), k: ti.template()):
-    """Gradient of a node's weight."""
+    """Return the gradient of a node's weight."""
     return ti.Vector([d[i][0] * w[j][1] * w[k][2], w[i][0] * d[j][1] * w[k][2], w[i][0] * w[j][1] * d[k][2]])
 
 
@@ -84,7 +84,7 @@ class Sheet:
 
     @ti.func
     def heavy(self, node):
-        """Mass on a node that a particle sees; its weight may be exactly 0."""
+        """Return the mass on a node that a particle sees; its weight may be exactly 0."""
         m = self.mass[node]
         return ti.select(m > 0.0, m, 1.0)
 
@@ -122,7 +122,7 @@ class Sheet:
 
     @ti.kernel
     def forces(self, s: ti.i32):
-        """Membrane and director, on vertices; what the director does through the grid, stored for the transfer."""
+        """Compute the forces on vertices, and store what the director does through the grid."""
         for e in range(self.E):
             t = self.faces[e]
             g = self.frame[e]
@@ -226,7 +226,7 @@ class Sheet:
 
     @ti.kernel
     def map_back(self, after: ti.i32):
-        """Directors after friction and separation."""
+        """Map the directors back after friction and separation."""
         for e in range(self.E):
             t = self.faces[e]
             x0 = self.x[after, t[0]]
@@ -263,7 +263,7 @@ class Sheet:
         self.map_back(after)
 
     def substep_back(self, k: int) -> None:
-        """Adjoint of the substep, on a grid that is made again."""
+        """Run the adjoint of the substep, on a grid that is made again."""
         self.clear()
         self.clear_grad()
         self.forces(k)
@@ -274,7 +274,7 @@ class Sheet:
         self.forces.grad(k)
 
     def forward(self) -> Outcome:
-        """Positions at the end."""
+        """Return the positions at the end."""
         self.begin()
         for k in range(self.substeps):
             self.substep(k)
@@ -298,12 +298,12 @@ class Sheet:
         return Outcome(self.end(), self.loss[None], self.start.grad.to_numpy(), self.youngs.grad[None])
 
     def warm_up(self) -> None:
-        """Compile."""
+        """Compile the kernels before they are timed."""
         whole, self.substeps = self.substeps, 2
         (self.gradient if self.grad else self.forward)()
         self.substeps = whole
 
     def end(self) -> np.ndarray:
-        """[V, 3] m."""
+        """Return the final positions [V, 3] m."""
         last = self.substeps if self.grad else self.substeps % 2
         return self.x.to_numpy()[last] - self.data.shift

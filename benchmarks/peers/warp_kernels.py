@@ -32,7 +32,7 @@ def lowest(place: wp.vec3):
 
 @wp.func
 def on_node(node: wp.vec4):
-    """Velocity from momentum and mass."""
+    """Compute the velocity from momentum and mass."""
     m = wp.where(node[3] > 0.0, node[3], 1.0)
     return wp.vec3(node[0] / m, node[1] / m, node[2] / m)
 
@@ -48,7 +48,7 @@ def forces(
     force: wp.array(dtype=wp.vec3),
     pull: wp.array(dtype=wp.vec3),
 ):
-    """Membrane and director, on vertices; what the director does through the grid, stored for the transfer."""
+    """Compute the forces on vertices, and store what the director does through the grid."""
     e = wp.tid()
     t = faces[e]
     g = frame[e]
@@ -191,7 +191,7 @@ def grid_to_elements(
     C_after: wp.array(dtype=wp.mat33),
     d3_after: wp.array(dtype=wp.vec3),
 ):
-    """Affine velocity; directors carried along, then mapped back to separation and friction."""
+    """Gather the affine velocity; directors carried along, then mapped back to separation and friction."""
     e = wp.tid()
     t = faces[e]
     place = (x[t[0]] + x[t[1]] + x[t[2]]) * (INVERSE / 3.0)

@@ -12,7 +12,7 @@ from ..contestant import Contestant, Outcome, Task, Unsupported
 from . import warp_kernels as kernels
 from .arrays import GRID_NODES_PER_AXIS, VERTEX_SHARE, Arrays, arrays
 
-LONGEST = 500  # substeps of a gradient: 3 MB each
+MAX_GRADIENT_SUBSTEPS = 500  # 3 MB of tape each
 
 
 class Warp(Contestant):
@@ -27,8 +27,8 @@ class Warp(Contestant):
         if task.quantity == "tangents8" or task.batch:
             raise Unsupported("our Warp version has neither forward mode nor batches")
         gradient = task.quantity == "gradient"
-        if gradient and task.substeps > LONGEST:
-            raise Unsupported(f"a tape of more than {LONGEST} substeps")
+        if gradient and task.substeps > MAX_GRADIENT_SUBSTEPS:
+            raise Unsupported(f"a tape of more than {MAX_GRADIENT_SUBSTEPS} substeps")
         sheet = Sheet(arrays(task.build_case(), task.substeps), task.substeps, gradient)
         if not gradient:
             wp.load_module(kernels, device="cpu")
@@ -76,7 +76,7 @@ class Sheet:
         self.states = [State(self.V, self.E, grad) for _ in range(substeps + 1 if grad else 2)]
 
     def substep(self, k: int, s: State, after: State) -> None:
-        """On scratch that starts at zero."""
+        """Run one substep, on scratch that starts at zero."""
 
         def launch(kernel, size: int, inputs: list, outputs: list) -> None:
             wp.launch(kernel, dim=size, inputs=inputs, outputs=outputs, device="cpu")
@@ -106,7 +106,7 @@ class Sheet:
         )
 
     def run(self) -> None:
-        """From the start to the loss."""
+        """Run from the start to the loss."""
         first, count = self.states[0], len(self.states)
         for field in (first.v, first.C, first.C_element, self.loss):
             field.zero_()
@@ -119,7 +119,7 @@ class Sheet:
         wp.launch(kernels.squares, self.V, inputs=[last.x, self.origin, share], outputs=[self.loss], device="cpu")
 
     def forward(self) -> Outcome:
-        """Positions at the end."""
+        """Return the positions at the end."""
         self.run()
         return Outcome(self.end())
 
@@ -132,5 +132,5 @@ class Sheet:
         return Outcome(self.end(), float(self.loss.numpy()[0]), gradient_x.copy(), gradient_youngs)
 
     def end(self) -> np.ndarray:
-        """[V, 3] m."""
+        """Return the final positions [V, 3] m."""
         return self.states[self.substeps % len(self.states)].x.numpy() - self.data.shift

@@ -344,7 +344,7 @@ class BendingLoop:
         self._stress = stress if self._stress is None else self.loop.call("copy15", stress, into=self._stress)
 
     def close(self) -> None:
-        """Hand the sum of all to the transposed stencil."""
+        """Add the transposed stencil of the sum of all to the transposed stencil."""
         if self._moment is not None:
             _ = self.curvature
             inputs = self._derivatives, self._normal_and_curvature[:4], self._area, self._moment
@@ -396,7 +396,7 @@ class VelocityStage:
             self.field = None
 
     def scatter_rows(self, loop: Loop, rows: int, now: list[int]) -> None:
-        """Overwrite the velocities of some rows of ``field``, from a loop over these.
+        """Replace the velocities of some rows of ``field``, from a loop over these.
 
         Raises:
             ValueError: the velocities are in registers.

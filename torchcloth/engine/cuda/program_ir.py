@@ -33,7 +33,7 @@ class FieldDecl(NamedTuple):
 
     @property
     def size(self) -> int:
-        """Count of numbers."""
+        """Number of values in the field."""
         return self.rows * self.comps
 
 

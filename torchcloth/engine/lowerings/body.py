@@ -74,7 +74,7 @@ def _pose_fields(builder: SubstepBuilder, name: str, solid: AbstractCollider) ->
 
 @lowers(Coulomb)
 def lower_coulomb(builder: SubstepBuilder, friction: Coulomb) -> tuple[Any, ...]:
-    """Return (kernel, coefficient)."""
+    """Return the kernel of Coulomb friction and its coefficient."""
     return "coulomb", builder.parameter(friction.field)
 
 
