@@ -32,7 +32,7 @@ def on_finer(made, hypothesis, key):
     model, setting = made
     finer, world = setting.fine_mesh, refine_model(model, [RECORDING])[0].build_world()
     e = finer.episodes[0]
-    base, moved = world.simulate_observed(e), hypothesis.apply(world, hypothesis.typical).frames(e)
+    base, moved = world.simulate_observed(e), hypothesis.apply(world, hypothesis.typical).simulate_observed(e)
     found = bin_residuals(base, finite_differences(base, [moved], [hypothesis.typical]), e, finer.surface, finer.rest)
     return align_rows(key, found.key, found.jacobian)[:, 0]
 
@@ -83,7 +83,7 @@ def test_an_accepted_one_keeps_its_mesh(made, asked):
     """Beside a small amplitude, too: its own column is about what it was asked by, from the finer mesh."""
     model, setting = made
     cause = replace(asked[1], step=1.0)  # slopes by the typical amplitude, both ways
-    found = linearise(model.plus(cause), setting)
+    found = linearise(model.with_hypothesis(cause), setting)
     place = len(model.point)
     column = 0.5 * sum(
         on_finer(made, replace(cause, typical=sign * cause.typical), found.bins[0].key) for sign in (1.0, -1.0)
@@ -95,7 +95,7 @@ def test_without_a_finer_mesh_it_is_as_the_others(made, asked):
     """As where experiments are planned."""
     model, setting = made
     done = run_episode(WorldCache(model), setting.episodes[0], None, asked, with_grasp_shifts=False)
-    coarse = asked[1].apply(model.world(), asked[1].typical).frames(setting.episodes[0])
+    coarse = asked[1].apply(model.build_world(), asked[1].typical).simulate_observed(setting.episodes[0])
     assert torch.equal(done.with_hypotheses[1].x, coarse.x)
 
 

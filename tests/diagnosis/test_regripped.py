@@ -35,7 +35,7 @@ def held(world, name):
 
 @pytest.mark.parametrize("along", [-0.012, 0.007])
 def test_the_edge_of_a_patch_goes_along_and_the_outline_stays(made, along):
-    world = made[0].world()
+    world = made[0].build_world()
     moved, before = move_grip_patches(world, along=along), world.cloth.mesh
     after = moved.cloth.mesh
     for name in ("left", "right"):
@@ -50,7 +50,7 @@ def test_the_edge_of_a_patch_goes_along_and_the_outline_stays(made, along):
 
 
 def test_a_wider_patch_grows_on_all_sides_and_the_next_grows_from_there(made):
-    world = made[0].world()
+    world = made[0].build_world()
     wider = move_grip_patches(world, wider=0.01)
     far = lambda w: np.linalg.norm(held(w, "left") - [0.0, sheet_episodes.SIDE], axis=1)  # noqa: E731
     np.testing.assert_allclose(far(wider), far(world) * (RADIUS + 0.01) / RADIUS)
@@ -63,9 +63,11 @@ def test_little_does_little_and_twice_as_much_twice_as_much(made):
     """Whole vertices would do nothing, and then all at once."""
     model, e, blank = made
     by = {h.name: h for h in dx.list_hypotheses(model, [blank])}
-    base = model.world().frames(e).x
+    base = model.build_world().simulate_observed(e).x
     for name in ("grip.width", "robot.regrasp"):
-        moved = [float((model.world([(by[name], a)]).frames(e).x - base).norm()) for a in (1e-4, 1e-3, 2e-3)]
+        moved = [
+            float((model.build_world([(by[name], a)]).simulate_observed(e).x - base).norm()) for a in (1e-4, 1e-3, 2e-3)
+        ]
         assert moved[0] > 1e-6
         assert moved[1] / moved[0] == pytest.approx(10.0, rel=0.2)
         assert moved[2] / moved[1] == pytest.approx(2.0, rel=0.2)
@@ -73,7 +75,7 @@ def test_little_does_little_and_twice_as_much_twice_as_much(made):
 
 def test_nobody_sees_another_mesh(made):
     """A first shape that goes to the other mesh and comes back is what it was, if it is as smooth as a parabola."""
-    world, e = made[0].world(), made[1]
+    world, e = made[0].build_world(), made[1]
     u, v = torch.as_tensor(world.cloth.mesh.uv).T
     shape = torch.stack([u - u * u, 3 * u * v, v + 2 * v * v], 1)
     other = move_grip_patches(world, wider=0.01, along=0.005)
@@ -88,7 +90,7 @@ def test_nobody_sees_another_mesh(made):
 def test_a_model_of_an_episode_starts_where_the_episode_says(made, tmp_path):
     model, _, blank = made
     by = {h.name: h for h in dx.list_hypotheses(model, [blank])}
-    path = dx.save_model(tmp_path / "held.tcm", model.plus(by["robot.regrasp"], 0.008), blank)
+    path = dx.save_model(tmp_path / "held.tcm", model.with_hypothesis(by["robot.regrasp"], 0.008), blank)
     cloth = dx.load_cloth_for(path, blank)
     first = build_episode(cloth, blank).initial
     u, bulge, v = (first - torch.tensor([0.0, 0.0, 1.0])).T.numpy()
@@ -101,7 +103,7 @@ def test_a_model_of_an_episode_starts_where_the_episode_says(made, tmp_path):
 
 
 def test_grips_without_a_place_and_patterns_without_room(made):
-    world = made[0].world()
+    world = made[0].build_world()
     named = world.with_cloth(boundaries={n: Grasp(held.index.tolist()) for n, held in world.cloth.boundaries.items()})
     assert move_grip_patches(named, wider=0.01) is named
     with pytest.raises(InvalidInput, match="150 mm further along; expected as much"):

@@ -58,13 +58,13 @@ def test_nothing_at_zero_and_twice_as_much_at_twice(made, name):
     model, setting = made
     h = next(h for h in list_hypotheses(model, [RECORDING]) if h.name == name)
     e = setting.episodes[0]
-    base = model.world().frames(e)
-    assert torch.equal(model.world([(h, 0.0)]).frames(e).x, base.x)
-    assert not any(p.requires_grad for p in model.world([(h, h.typical)]).cloth.parameters())
+    base = model.build_world().simulate_observed(e)
+    assert torch.equal(model.build_world([(h, 0.0)]).simulate_observed(e).x, base.x)
+    assert not any(p.requires_grad for p in model.build_world([(h, h.typical)]).cloth.parameters())
     if h.effect == "air.wind":  # brings its drag along
         return
     share = (0.05, 0.1)
-    moved = [(model.world([(h, s * h.typical)]).frames(e), s) for s in share]
+    moved = [(model.build_world([(h, s * h.typical)]).simulate_observed(e), s) for s in share]
     small, twice = ((f.x - base.x).norm() + (f.edge - base.edge).norm() for f, _ in moved)
     shows = float(twice) > 1e-4  # m, of all vertices and frames together: else the substep, chosen anew, does
     assert shows == (name not in CRITERIA.candidate.simulator_tolerance), float(twice)
@@ -75,8 +75,8 @@ def test_nothing_at_zero_and_twice_as_much_at_twice(made, name):
 def test_air_and_hem_do_what_their_names_say(made):
     model, setting = made
     e, by = setting.episodes[0], {h.name: h for h in list_hypotheses(model, [RECORDING])}
-    last = lambda name, a: model.world([(by[name], a)]).frames(e).x[-1]  # noqa: E731
-    base = model.world().frames(e).x[-1]
+    last = lambda name, a: model.build_world([(by[name], a)]).simulate_observed(e).x[-1]  # noqa: E731
+    base = model.build_world().simulate_observed(e).x[-1]
     free = base[:, 2] < 1.1
     assert float((last("air.drag_n", 5.0) - base)[free, 1].mean()) < -1e-5  # it lags behind the grippers
     assert float((last("air.wind[y]", 1.0) - last("air.drag_n", 1.2))[free, 1].mean()) > 1e-5
@@ -93,8 +93,8 @@ def test_air_and_hem_do_what_their_names_say(made):
 def test_cells_know_what_a_longer_depth_does_to_them(made):
     model, setting = made
     e, by = setting.episodes[0], {h.name: h for h in list_hypotheses(model, [RECORDING])}
-    cells = lambda world: bin_residuals(world.frames(e), None, e, setting.surface, setting.rest)  # noqa: E731
-    base, off = cells(model.world()), cells(model.world([(by["obs.depth_bias"], 1e-4)]))
+    cells = lambda world: bin_residuals(world.simulate_observed(e), None, e, setting.surface, setting.rest)  # noqa: E731
+    base, off = cells(model.build_world()), cells(model.build_world([(by["obs.depth_bias"], 1e-4)]))
     seen = base.block < FORCE_BLOCK
     assert torch.equal(base.key, off.key)
     assert float(base.depth_slope[seen].abs().max()) > 0.5
@@ -104,7 +104,7 @@ def test_cells_know_what_a_longer_depth_does_to_them(made):
         base.depth_slope.square().mean().sqrt()
     )
     unplaced = bin_residuals(
-        model.world().frames(e), None, replace(e, camera_position=None), setting.surface, setting.rest
+        model.build_world().simulate_observed(e), None, replace(e, camera_position=None), setting.surface, setting.rest
     )
     assert not unplaced.depth_slope.any(), "no camera, or several"
 
@@ -113,11 +113,11 @@ def test_cells_know_what_a_longer_depth_does_to_them(made):
 def test_whatever_was_accepted_all_others_still_apply(made, first):
     model, _ = made
     by = {h.name: h for h in list_hypotheses(model, [RECORDING])}
-    alone = model.world([(by[first], by[first].typical)])
+    alone = model.build_world([(by[first], by[first].typical)])
     for h in by.values():
-        both = model.world([(by[first], by[first].typical), (h, h.typical)])
+        both = model.build_world([(by[first], by[first].typical), (h, h.typical)])
         changed = digest(cloth_fingerprint_parts(both.cloth)) != digest(cloth_fingerprint_parts(alone.cloth))
-        seen = (len(both.motions), len(both.views)) != (len(alone.motions), len(alone.views))
+        seen = (len(both.motion_transforms), len(both.observation_transforms)) != (len(alone.motion_transforms), len(alone.observation_transforms))
         assert changed or seen, h.name
 
 
@@ -253,18 +253,18 @@ def test_dense_clouds_are_thinned_alike_on_both_meshes(made):
 def test_two_effects_in_one_part_keep_both(made):
     model, _ = made
     by = {h.name: h for h in list_hypotheses(model, [RECORDING])}
-    world = model.world([(by["air.drag_n"], 0.8), (by["air.wind[x]"], 0.3), (by["air.drag_t"], 0.02)])
+    world = model.build_world([(by["air.drag_n"], 0.8), (by["air.wind[x]"], 0.3), (by["air.drag_t"], 0.02)])
     air = world.cloth.effects["air"]
     assert (float(air.normal.value), float(air.tangential.value)) == pytest.approx((0.8, 0.02))
     assert air.wind.tolist() == pytest.approx([0.3, 0.0, 0.0])
-    bending = model.world(
+    bending = model.build_world(
         [(by[name], by[name].typical) for name in ("rest.curl[weft]", "plast.crease", "damp.bend", "bend.aniso")]
     ).cloth.effects["bending"]
     found = [float(getattr(bending, name).value) for name in ("curl_weft", "mobility", "damping_time", "weft_ratio")]
     assert found == pytest.approx([3.0, 5.0, 0.06, 0.4])
-    rest = model.world([(by["rest.shrink[warp]"], 0.02), (by["rest.skew"], 0.01)]).cloth.effects["rest_shape"]
+    rest = model.build_world([(by["rest.shrink[warp]"], 0.02), (by["rest.skew"], 0.01)]).cloth.effects["rest_shape"]
     assert (float(rest.shrink_warp.value), float(rest.skew.value)) == pytest.approx((0.02, 0.01))
-    woven = model.world([(by["elas.ortho"], 0.5), (by["elas.shear"], -0.4)]).cloth.material
+    woven = model.build_world([(by["elas.ortho"], 0.5), (by["elas.shear"], -0.4)]).cloth.material
     assert float(woven.weft_modulus.value / woven.youngs_modulus.value) == pytest.approx(0.5)
     assert float(woven.shear_modulus.value * 2 * 1.3 / woven.youngs_modulus.value) == pytest.approx(0.6)
 
@@ -272,12 +272,12 @@ def test_two_effects_in_one_part_keep_both(made):
 def test_stiffening_of_the_base_leaves_one_modulus_and_adds_to_what_exceeds_it(made):
     model, _ = made
     by = {h.name: h for h in list_hypotheses(model, [RECORDING])}
-    stiff = model.at(model.point + 1.2 * torch.eye(len(model.point)).double()[-1])
-    assert type(model.world().cloth.material) is materials.AEP
-    cloth = stiff.world([(by["elas.stiffen"], 8.0)]).cloth.material
+    stiff = model.at_point(model.point + 1.2 * torch.eye(len(model.point)).double()[-1])
+    assert type(model.build_world().cloth.material) is materials.AEP
+    cloth = stiff.build_world([(by["elas.stiffen"], 8.0)]).cloth.material
     assert type(cloth) is materials.StiffeningAEP
     assert float(cloth.stiffening.value) == pytest.approx(9.2)
-    woven = stiff.world([(by["elas.shear"], -0.4)]).cloth.material
+    woven = stiff.build_world([(by["elas.shear"], -0.4)]).cloth.material
     assert [float(c.value) for c in (woven.warp_stiffening, woven.weft_stiffening)] == pytest.approx([1.2, 1.2])
 
 
@@ -287,7 +287,7 @@ def test_the_base_is_in_vacuum_and_left_alone(made):
     with_air = replace(RECORDING, air_density=1.2)
     assert set(build_base_model(with_air).base.cloth.effects) == {"gravity", "bending"}
     before = {name: value.clone() for name, value in model.base.cloth.state_dict().items()}
-    model.at(model.point + 0.3).world([(h, h.typical) for h in list_hypotheses(model, [RECORDING])[:5]])
+    model.at_point(model.point + 0.3).build_world([(h, h.typical) for h in list_hypotheses(model, [RECORDING])[:5]])
     for name, value in model.base.cloth.state_dict().items():
         assert torch.equal(value, before[name]), name
 
@@ -313,7 +313,7 @@ def test_a_hypothesis_of_ones_own_joins_the_search(made):
     model, _ = made
     own = register(Hypothesis("user.sag", "m", 0.01, lambda world, a: world.with_observation_transform(lambda f, _: f)))
     assert own in list_hypotheses(model, [RECORDING])
-    assert own not in list_hypotheses(model.plus(own, 0.01), [RECORDING])
+    assert own not in list_hypotheses(model.with_hypothesis(own, 0.01), [RECORDING])
     unregister("user.sag")
     assert own not in list_hypotheses(model, [RECORDING])
 
@@ -321,10 +321,15 @@ def test_a_hypothesis_of_ones_own_joins_the_search(made):
 def test_a_model_file_gives_the_same_world(made, tmp_path):
     model, setting = made
     by = {h.name: h for h in list_hypotheses(model, [RECORDING])}
-    extended = model.at(model.point + 0.1).plus(by["air.drag_n"], 0.9).plus(by["rest.shrink[warp]"], -0.02)
+    extended = (
+        model.at_point(model.point + 0.1)
+        .with_hypothesis(by["air.drag_n"], 0.9)
+        .with_hypothesis(by["rest.shrink[warp]"], -0.02)
+    )
     again = load_model(save_model(tmp_path / "m.tcm", extended, RECORDING))
     assert torch.equal(
-        again.build_world().simulate_observed(setting.episodes[0]).x, extended.world().frames(setting.episodes[0]).x
+        again.build_world().simulate_observed(setting.episodes[0]).x,
+        extended.build_world().simulate_observed(setting.episodes[0]).x,
     )
     assert [h.name for h in again.accepted] == ["air.drag_n", "rest.shrink[warp]"]
 
@@ -337,7 +342,7 @@ def test_model_files_that_cannot_be_read_are_refused(made, tmp_path):
     with pytest.raises(RecordingError, match="unreadable"):
         load_model(tmp_path / "bad.tcm")
     stranger = Hypothesis("user.unknown", "-", 1.0, lambda world, _: world)
-    path = save_model(tmp_path / "m.tcm", model.plus(stranger, 1.0), RECORDING)
+    path = save_model(tmp_path / "m.tcm", model.with_hypothesis(stranger, 1.0), RECORDING)
     with pytest.raises(InvalidInput, match=r"'user.unknown'.*register"):
         load_model(path)
 
@@ -412,10 +417,13 @@ def test_a_seam_is_the_same_on_every_mesh(columns):
 def test_drag_beside_wind_says_what_it_counts_from(made):
     model, _ = made
     by = {h.name: h for h in EVERY}
-    both = model.plus(by["air.wind[x]"], 0.3).plus(by["air.drag_n"], 0.4)
-    assert both.world().cloth.effects["air"].normal.value.item() == pytest.approx(1.6)
+    both = model.with_hypothesis(by["air.wind[x]"], 0.3).with_hypothesis(by["air.drag_n"], 0.4)
+    assert both.build_world().cloth.effects["air"].normal.value.item() == pytest.approx(1.6)
     assert warn_of_implied_amplitudes(both) == ["air.drag_n = 0.4 comes on top of the 1.2 that air.wind[x] brought"]
-    assert warn_of_implied_amplitudes(model.plus(by["air.drag_n"], 0.4).plus(by["air.wind[x]"], 0.3)) == []
+    assert (
+        warn_of_implied_amplitudes(model.with_hypothesis(by["air.drag_n"], 0.4).with_hypothesis(by["air.wind[x]"], 0.3))
+        == []
+    )
 
 
 def test_an_episode_without_a_motion_has_a_name_that_no_other_has():
@@ -426,7 +434,7 @@ def test_an_episode_without_a_motion_has_a_name_that_no_other_has():
 def test_drag_that_was_found_and_is_none_does_not_come_along_with_wind(made):
     model, _ = made
     by = {h.name: h for h in EVERY}
-    blown = lambda of: float(of.plus(by["air.wind[x]"], 0.5).world().cloth.effects["air"].normal.value)  # noqa: E731
-    assert blown(model.plus(by["air.drag_n"], 0.0)) == 0.0
-    assert blown(model.plus(by["air.drag_n"], 1e-3)) == pytest.approx(1e-3)
+    blown = lambda of: float(of.with_hypothesis(by["air.wind[x]"], 0.5).build_world().cloth.effects["air"].normal.value)  # noqa: E731
+    assert blown(model.with_hypothesis(by["air.drag_n"], 0.0)) == 0.0
+    assert blown(model.with_hypothesis(by["air.drag_n"], 1e-3)) == pytest.approx(1e-3)
     assert blown(model) == pytest.approx(1.2)
