@@ -99,7 +99,7 @@ def is_agreed(tried, fit=None, role="accepted"):
 @pytest.mark.parametrize(("asked", "agreed"), [(0.1, True), (-0.5, False)])
 def test_motions_that_all_take_a_cause_away_do_not_agree_that_it_is_there(asked, agreed):
     """At zero, where an amplitude without a sign ends, they differ by nothing at all."""
-    tried = candidate(asked, mesh_differences=0.0)
+    tried = candidate(asked, 0.0)
     assert is_agreed(tried) == agreed
 
 

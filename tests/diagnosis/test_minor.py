@@ -154,7 +154,7 @@ def test_what_predicts_better_and_motions_disagree_about_is_a_rival(monkeypatch,
 def test_what_was_brought_along_takes_the_place_of_what_brought_it(monkeypatch, left, over, passed, named):
     """Where hardly any wind is left, and the drag alone predicts about as well and better than its placebos."""
     drag, wind = candidate("air.drag_n", 1.2, 1.4), candidate("air.wind[y]", 0.3, 0.2, implies="air.drag_n")
-    drag.fitted, drag.sole_informative_motion = None, set()
+    drag.fit, drag.sole_informative_motion = None, set()
     camera = toys.hypothesis("obs.extrinsic[y]", 4e-3)
     base = WorldModel(None, (), toys.torch.zeros(0), (camera,), (4e-3,))  # type: ignore[arg-type]
     current = SimpleNamespace(model=base.with_hypothesis(wind.hypothesis, left), linearisation=None)

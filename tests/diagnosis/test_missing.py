@@ -87,13 +87,13 @@ def test_the_fit_lacks_there_and_not_in_the_other_motion(planted):
 def test_pushes_are_those_of_a_body_force(planted):
     """A constant push from the first frame on, against finite differences of a simulation with that force."""
     found, setting = planted
-    world, episode = found.model.world(), setting.episodes[0]
+    world, episode = found.model.build_world(), setting.episodes[0]
     last, count = len(episode.times) - 1, len(setting.rest)
     push = torch.zeros(2, 1, count, 3)
     push[:, 0, :, 1] = 1.0
     frames, moved = differentiate_pulses(world, episode, ForcePulses([(0, 5), (5, last)], push))
     step = 1e-3
-    beside = world.with_cloth({"more": BodyForce(step * push[0, 0])}).frames(episode)
+    beside = world.with_cloth({"more": BodyForce(step * push[0, 0])}).simulate_observed(episode)
     difference = (beside.x - frames.x) / step
     assert torch.allclose(moved.x[0], difference, atol=1e-2 * float(difference.abs().max()))
 

@@ -37,7 +37,7 @@ def test_a_part_of_the_fabric_has_its_misfit_where_it_lies(gathered):
         assert tiles[cells.window[k]].get_title() == f"{BIN_SECONDS * cells.window[k]:.1f} s"
         image = tiles[cells.window[k]].images[0]
         left, right, low, high = image.get_extent()
-        field, (u, v, _) = image.get_array(), cells.place[k].tolist()
+        field, (u, v, _) = image.get_array(), cells.rest_position[k].tolist()
         rows, columns = field.shape
         row, column = int(rows * (v - low) / (high - low)), int(columns * (u - left) / (right - left))
         assert field[row, column] == pytest.approx(1e3 * cells.value[k].item())
@@ -51,7 +51,7 @@ def test_a_part_of_the_fabric_has_its_misfit_where_it_lies(gathered):
 def test_parts_that_nobody_saw_are_grey(gathered):
     evidence, setting = gathered
     cells = evidence.bins[0]
-    kept = ~((cells.window == 0) & (cells.patch < 3))
+    kept = ~((cells.window == 0) & (cells.channel < 3))
     less = replace(evidence, bins=[type(cells)(*(column[kept] for column in cells))])
     tile = draw_misfit_maps(less, setting).axes[0]
     unseen = tile.images[1].get_array()[..., 3] > 0
@@ -64,7 +64,7 @@ def test_an_episode_without_points_has_an_empty_map_and_markers_do_as_well(gathe
     cells = evidence.bins[0]
     blind = type(cells)(*(column[cells.block != 0] for column in cells))
     marked = cells._replace(
-        block=torch.where(cells.block == 0, BLOCK_NAMES.index("markers"), cells.block), channel=3 * cells.patch + 2
+        block=torch.where(cells.block == 0, BLOCK_NAMES.index("markers"), cells.block), channel=3 * cells.channel + 2
     )
 
     def maps(*every):

@@ -27,12 +27,12 @@ def numbers(world):
 def test_they_are_those_of_the_model(model):
     shifts = central_steps(model)
     worlds = WorldCache(model, shifts, model.base)
-    assert numbers(worlds.base) == numbers(worlds.fine) == numbers(model.world())
+    assert numbers(worlds.base) == numbers(worlds.fine) == numbers(model.build_world())
     assert [numbers(w) for w in worlds.shifted] == [numbers(shift_model(model, *s).build_world()) for s in shifts]
     drag = next(h for h in list_hypotheses(model, [RECORDING]) if h.name == "air.drag_n")
     changed = worlds.with_typical(drag)
     assert changed is not None
-    assert numbers(changed) == numbers(drag.apply(model.world(), drag.typical))
+    assert numbers(changed) == numbers(drag.apply(model.build_world(), drag.typical))
 
 
 def test_each_is_made_once_by_many_threads(model):

@@ -18,7 +18,7 @@ def test_what_a_parameter_does_already_has_its_slopes(made):
     """By the share of its value, wherever that is; it is not simulated."""
     model, setting = made
     by, place = {h.name: h for h in list_hypotheses(model, [RECORDING])}, [p.name for p in model.parameters]
-    there = model.at(torch.full_like(model.point, 0.1))
+    there = model.at_point(torch.full_like(model.point, 0.1))
     asked = [by["mass.density"], by["air.drag_n"]]
     at_once, before = linearise(there, setting, asked), linearise(there, setting)
     later = linearise_hypotheses(before, there, setting, asked)
@@ -89,7 +89,7 @@ def test_steps_end_at_bounds_and_slopes_know_it(made):
     """Poisson's ratio at its largest value: a step on from there is none, one back tells."""
     model, setting = made
     place = [p.name for p in model.parameters].index("poisson_ratio")
-    end = model.at(model.point + 9.0 * torch.eye(len(model.point)).double()[place])
+    end = model.at_point(model.point + 9.0 * torch.eye(len(model.point)).double()[place])
     step = model.parameters[place].step
     assert one_sided_steps(end) == [(k, -s if k == place else s) for k, s in list_steps(end)]
     near, _, back = (
@@ -114,7 +114,7 @@ def test_slopes_along_parameters_are_central_and_their_disagreement_is_rough(mad
     """At the end of a coordinate one side is all there is, and says nothing of roughness."""
     model, setting = made
     steps, last = [p.step for p in model.parameters], len(model.parameters) - 1
-    model = model.at(model.point + 2 * steps[last] * torch.eye(last + 1)[last])  # stiffening, off its end
+    model = model.at_point(model.point + 2 * steps[last] * torch.eye(last + 1)[last])  # stiffening, off its end
     shifts = [(k, sign * step) for k, step in enumerate(steps) for sign in (1.0, -1.0)]
     raw, found = linearise(model, setting, shifts=shifts), linearise(model, setting)
     (one,), (cells,) = raw.bins, found.bins

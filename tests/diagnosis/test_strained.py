@@ -10,7 +10,7 @@ from helpers import linear_evidence as toys
 from torchcloth.diagnosis.data.dataset import DiagnosisData
 from torchcloth.diagnosis.decide import candidates, search
 from torchcloth.diagnosis.decide.candidates import AcceptedCause, Candidate
-from torchcloth.diagnosis.decide.criteria import CRITERIA
+from torchcloth.diagnosis.decide.criteria import CRITERIA, RestartCriteria
 from torchcloth.diagnosis.inference import prior_restarts
 from torchcloth.diagnosis.inference.prior_restarts import refit_from_prior
 from torchcloth.episodes.world import STRAINED_PRIOR_STDS
@@ -90,7 +90,7 @@ def test_causes_with_which_positions_are_hardly_better_predicted_are_none(
 ):
     """Though each did better when it was accepted, with the noise of then."""
     one = found(0.1)
-    whole = SimpleNamespace(before=1e-3, after=after, explained_fraction=explained, rms_removed=(4e-4, pulls))
+    whole = SimpleNamespace(rms_before=1e-3, rms_after=after, explained_fraction=explained, rms_removed=(4e-4, pulls))
     row = SimpleNamespace(hypothesis=CAUSE)
     first = AcceptedCause(
         Candidate(row, one, None, None, set(), 0.0, restores_prior=relieves), None, [], [], [], one, None
@@ -103,7 +103,7 @@ def test_causes_with_which_positions_are_hardly_better_predicted_are_none(
     monkeypatch.setattr(search, "has_lack_of_fit", lambda *_: lacking)
     monkeypatch.setattr(search, "_drop_new_bifurcations", lambda start, current, setting, _: (start, current, setting))
     monkeypatch.setattr(search, "_compute_total_gain", lambda *_: whole)
-    _, steps, _ = search._chain(one, SimpleNamespace(motions=["a"]), [CAUSE], lambda _: None, 4, first)  # type: ignore[arg-type]
+    _, steps, _ = search._search_stepwise(one, SimpleNamespace(motions=["a"]), [CAUSE], lambda _: None, 4, first)  # type: ignore[arg-type]
     assert steps == ([first] if kept else [])
 
 
@@ -117,7 +117,7 @@ def test_the_next_cause_is_looked_for_from_both_or_from_the_better_one(monkeypat
     monkeypatch.setattr(search, "fit", lambda *_, **__: strained)
     monkeypatch.setattr(search, "predictive_gain", lambda *_: 1.0 if better else -1.0)
     monkeypatch.setattr(search, "screen", lambda f: [f])
-    monkeypatch.setattr(search, "propose_candidates", lambda f, screened, tried, after=0: [(row, f.model)])
+    monkeypatch.setattr(search, "propose_candidates", lambda f, scores, count, skip=0: [(row, f.model)])
     monkeypatch.setattr(
         search, "evaluate_candidates", lambda current, setting, begun, *_: looked.append((current, begun))
     )
@@ -125,9 +125,11 @@ def test_the_next_cause_is_looked_for_from_both_or_from_the_better_one(monkeypat
     monkeypatch.setattr(search, "fraction_explained", lambda *_: 1.0)
     monkeypatch.setattr(search, "has_lack_of_fit", lambda *_: False)
     monkeypatch.setattr(
-        search, "_compute_total_gain", lambda *_: SimpleNamespace(before=1.0, after=0.5, explained_fraction=0.75)
+        search,
+        "_compute_total_gain",
+        lambda *_: SimpleNamespace(rms_before=1.0, rms_after=0.5, explained_fraction=0.75),
     )
-    end, _, _ = search._chain(strained, SimpleNamespace(motions=["a"]), [CAUSE], lambda _: None, 4, first)  # type: ignore[arg-type]
+    end, _, _ = search._search_stepwise(strained, SimpleNamespace(motions=["a"]), [CAUSE], lambda _: None, 4, first)  # type: ignore[arg-type]
     ((current, begun),) = looked
     assert current is end is (anew if better else strained)
     assert [model for _, model in begun] == ([anew.model] if better else [strained.model, anew.model])
@@ -150,9 +152,11 @@ def test_causes_are_doubted_again_where_all_are_fitted_on(monkeypatch, ahead):
     monkeypatch.setattr(search, "fraction_explained", lambda *_: 1.0)
     monkeypatch.setattr(search, "has_lack_of_fit", lambda *_: False)
     monkeypatch.setattr(
-        search, "_compute_total_gain", lambda *_: SimpleNamespace(before=1.0, after=0.5, explained_fraction=0.75)
+        search,
+        "_compute_total_gain",
+        lambda *_: SimpleNamespace(rms_before=1.0, rms_after=0.5, explained_fraction=0.75),
     )
-    end, _, _ = search._chain(far, SimpleNamespace(motions=["a"]), [CAUSE], lambda _: None, 4, first)  # type: ignore[arg-type]
+    end, _, _ = search._search_stepwise(far, SimpleNamespace(motions=["a"]), [CAUSE], lambda _: None, 4, first)  # type: ignore[arg-type]
     assert doubted == ([far, near] if ahead else [far])
     assert end is doubted[-1]
 
@@ -176,10 +180,10 @@ def test_where_nothing_is_lacking_a_cause_from_the_data_sheet_must_surely_gain(
     first = AcceptedCause(Candidate(None, start, None, gain, set(), 0.0), None, [], [], [], start, None)  # type: ignore[arg-type]
     monkeypatch.setattr(search, "has_lack_of_fit", lambda *_: lacking)
     monkeypatch.setattr(search, "screen", lambda f: [])
-    monkeypatch.setattr(search, "afresh", lambda *a: tried.append(a[-1]) or [])
+    monkeypatch.setattr(search, "propose_from_prior", lambda *a: tried.append(a[-1]) or [])
     monkeypatch.setattr(search, "evaluate_candidates", lambda *_: first)
-    monkeypatch.setattr(search, "_chain", lambda *a: (start, [a[-1]], None))
-    _, steps, _ = search._anew(start, SimpleNamespace(motions=[*motions]), [CAUSE], lambda _: None)  # type: ignore[arg-type]
+    monkeypatch.setattr(search, "_search_stepwise", lambda *a: (start, [a[-1]], None))
+    _, steps, _ = search._search_from_prior(start, SimpleNamespace(motions=[*motions]), [CAUSE], lambda _: None)  # type: ignore[arg-type]
     assert steps == ([first] if named else [])
     assert tried == ([] if motions == "aab" else [0.0 if lacking else CRITERIA.screening.min_expected_gain])
 
@@ -190,9 +194,9 @@ def test_little_is_not_tried_from_the_data_sheet(monkeypatch, least, tried):
     causes = [toys.hypothesis(name, 2.0) for _, name, _ in promised]
     monkeypatch.setattr(prior_restarts, "linearise", lambda *_: found(0.0).linearisation)
     monkeypatch.setattr(prior_restarts, "linearise_hypotheses", lambda here, *_: here)
-    monkeypatch.setattr(prior_restarts, "_promises", lambda _: promised)
-    monkeypatch.setattr(prior_restarts, "WORTH_TRYING", 0.4)
-    monkeypatch.setattr(prior_restarts, "with_cause", lambda _, h: h)
+    monkeypatch.setattr(prior_restarts, "_expected_gains", lambda _: promised)
+    monkeypatch.setattr(prior_restarts, "CRITERIA", replace(CRITERIA, restart=RestartCriteria(0.4)))
+    monkeypatch.setattr(prior_restarts, "add_cause", lambda _, h: h)
     begun = prior_restarts.propose_from_prior(found(0.0), None, causes, 4, lambda _: None, least)  # type: ignore[arg-type]
     assert [h.name for h, _ in begun] == tried
 
@@ -210,12 +214,13 @@ def test_little_is_not_tried_from_the_data_sheet(monkeypatch, least, tried):
 def test_what_one_motion_alone_tells_must_surely_gain(monkeypatch, motions, alone, surely, useful):
     """No other motion has predicted it; of two, the other one tells little of what is usual."""
     monkeypatch.setattr(candidates, "is_improvement", lambda *_: True)
-    monkeypatch.setattr(candidates, "accept", lambda *_: True)
-    gain, row = SimpleNamespace(lower_bound_95=surely), SimpleNamespace(hypothesis=CAUSE)
+    fit = found(0.1)
+    monkeypatch.setattr(candidates, "jackknife", lambda *_: (fit.model.point, torch.zeros(2)))
+    gain, score = SimpleNamespace(lower_bound_95=surely), SimpleNamespace(hypothesis=CAUSE, mesh_bias=0.0)
     predicted = SimpleNamespace(episode=torch.arange(len(motions)))
-    found = Candidate(row, None, predicted, gain, alone, 2.0)  # type: ignore[arg-type]
-    assert candidates._useful(found, motions) == useful
-    assert candidates._useful(found, [*motions, "one whose cells all jump"]) == useful
+    tried = Candidate(score, fit, predicted, gain, alone, 2.0)  # type: ignore[arg-type]
+    assert candidates.accept(tried, motions) == useful
+    assert candidates.accept(tried, [*motions, "one whose bins all respond discontinuously"]) == useful
 
 
 @pytest.mark.parametrize(("amplitude", "tries"), [(1.0, ["first"]), (11.0, ["first", "more"])])
@@ -234,7 +239,7 @@ def test_where_what_predicts_best_is_too_large_to_be_believed_more_are_tried(mon
     def enough(_):
         raise Enough
 
-    monkeypatch.setattr(candidates, "_tried", likely)
+    monkeypatch.setattr(candidates, "_fit_candidates", likely)
     monkeypatch.setattr(candidates, "fit_noise", enough)
     with pytest.raises(Enough):
         candidates.evaluate_candidates(found(0.1), None, "first", [], print, "more")  # type: ignore[arg-type]
@@ -251,7 +256,7 @@ def test_further_steps_are_kept_unless_they_predict_worse_than_a_cause(first, th
         name: SimpleNamespace(name=name, amplitude=amplitude, gain=SimpleNamespace(log_density=density))
         for name, amplitude, density in (("first", first, 50.0), ("then", then, predicts))
     }
-    assert candidates._better(*fits.values()).name == kept  # type: ignore[arg-type]
+    assert candidates._choose_fit(*fits.values()).name == kept  # type: ignore[arg-type]
 
 
 def test_what_a_model_has_is_not_asked_about_again(monkeypatch):
@@ -278,9 +283,9 @@ def test_what_a_model_has_is_not_asked_about_again(monkeypatch):
 class Asked:
     """Of a setting, what a chain of causes needs."""
 
-    names: list[str]
-    unstable: tuple[torch.Tensor, ...]
-    less = DiagnosisData.without_bins
+    motions: list[str]
+    bifurcating_bins: tuple[torch.Tensor, ...]
+    without_bins = DiagnosisData.without_bins
 
 
 @pytest.mark.parametrize(
@@ -297,7 +302,7 @@ def test_cells_that_jump_with_a_cause_are_left_out_where_nothing_else_is_lacking
     monkeypatch.setattr(
         search, "fit", lambda model, setting, *_, **__: search.drop_bins(whole, setting.bifurcating_bins)
     )
-    monkeypatch.setattr(search, "unstable", lambda *_: second)
+    monkeypatch.setattr(search, "find_bifurcating_bins", lambda *_: second)
     less = lambda f: len(whole.linearisation.bins[0].key) - len(f.linearisation.bins[0].key)  # noqa: E731
     monkeypatch.setattr(search, "has_lack_of_fit", lambda f, _: less(f) in lacking)
     monkeypatch.setattr(search, "screen", lambda f: [])
@@ -305,10 +310,12 @@ def test_cells_that_jump_with_a_cause_are_left_out_where_nothing_else_is_lacking
     monkeypatch.setattr(search, "drop_redundant", lambda current, steps, *_: (current, steps))
     monkeypatch.setattr(search, "fraction_explained", lambda *_: float(kept))
     monkeypatch.setattr(
-        search, "_compute_total_gain", lambda *_: SimpleNamespace(before=1.0, after=0.5, explained_fraction=0.75)
+        search,
+        "_compute_total_gain",
+        lambda *_: SimpleNamespace(rms_before=1.0, rms_after=0.5, explained_fraction=0.75),
     )
     asked = Asked(["a"] * toys.EPISODES, first)
-    found = search._chain(start, asked, [], lambda _: None, 4, step)  # type: ignore[arg-type]
+    found = search._search_stepwise(start, asked, [], lambda _: None, 4, step)  # type: ignore[arg-type]
     assert found.accepted == ([step] if kept else [])
     for cells, keys, before in zip(
         found.fit.linearisation.bins, found.data.bifurcating_bins, whole.linearisation.bins, strict=True

@@ -69,7 +69,7 @@ def test_what_fails_at_some_amplitudes_only_is_no_world_there(world):
     assert isinstance(own.apply_to(model.base, 1.0), type(model.base))
     for amplitude, said in ((-1.0, "ValueError"), (9.0, "no World")):
         with pytest.raises(InvalidInput, match=f"hypothesis 'my.root'; got .*{said}"):
-            model.plus(own, amplitude).world()
+            model.with_hypothesis(own, amplitude).build_world()
 
 
 def test_what_is_given_and_not_registered_is_ones_own_as_well(world):

@@ -20,7 +20,7 @@ def predicted(std=0.003):
 
 
 def answer(*effects):
-    cause = {"class": [], "rivals": [], "amplitude": 1.0, "unit": "-", "ci95": [0.5, 1.5]}
+    cause = {"equivalence_class": [], "rivals": [], "amplitude": 1.0, "unit": "-", "ci95": [0.5, 1.5]}
     return {
         "runs": ["range30_rep1"],
         "asked": 36,

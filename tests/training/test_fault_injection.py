@@ -55,14 +55,15 @@ def test_without_data_it_says_so(tmp_path, monkeypatch, capsys):
 def test_what_diagnoses_say_is_told_beside_the_truth():
     from rich.console import Console
 
-    clock = {"effect": "obs.clock", "amplitude": -0.021, "unit": "s", "ci95": [-0.025, -0.017], "class": ["obs.clock"]}
+    clock = {"effect": "obs.clock", "amplitude": -0.021, "unit": "s", "ci95": [-0.025, -0.017]}
+    clock |= {"equivalence_class": ["obs.clock"]}
     air = {"effect": "air.linear", "amplitude": 2.8, "unit": "1/s", "ci95": [1.6, 4.0]}
     answers = {
-        "plain": {"verdict": "unexplained", "causes": [], "given": []},
+        "plain": {"verdict": "unexplained", "causes": [], "initial_causes": []},
         "stamps 20 ms late": {
             "verdict": "ambiguous",
             "causes": [clock | {"rivals": [{"effect": "obs.extrinsic[z]"}]}],
-            "given": [air],
+            "initial_causes": [air],
         },
     }
     console = Console(width=200, record=True, file=io.StringIO())

@@ -86,7 +86,7 @@ def _rows(table_rows: Any, answer: dict[str, Any]) -> None:
     gain = answer["gain"]
     rms_text = f"{1e3 * gain['rms_before']:.1f} > {1e3 * gain['rms_after']:.1f}" if gain else ""
     for k, cause in enumerate(answer["causes"]):
-        others = {*cause["class"], *(r["effect"] for r in cause["rivals"])} - {cause["effect"]}
+        others = {*cause["equivalence_class"], *(r["effect"] for r in cause["rivals"])} - {cause["effect"]}
         size = f"{cause['amplitude']:.3g} ({cause['ci95'][0]:.3g} to {cause['ci95'][1]:.3g}) {cause['unit']}"
         head = ["", "", ""] if k else [runs, answer["verdict"], rms_text]
         table_rows.add_row(*head[:2], escape(cause["effect"]), escape(", ".join(sorted(others))), size, head[2])

@@ -151,7 +151,8 @@ def diagnose_blindly(source: Path, label: str, options: argparse.Namespace) -> d
             options.out / _file(UNCHANGED) / EXTENDED_MODEL_FILE, [_inject(r, FAULTS[label]) for r in recordings]
         )
     answer = diagnosis_in(options.out / _file(label), recordings, model)
-    return {key: answer.content[key] for key in ("verdict", "causes", "given", "also_unexplained", "undecided")}
+    keys = ("verdict", "causes", "initial_causes", "also_unexplained", "undecided")
+    return {key: answer.content[key] for key in keys}
 
 
 def _file(label: str) -> str:
@@ -239,8 +240,9 @@ def _blind_table(answers: dict[str, Any]) -> Any:
     for label, answer in answers.items():
         fault = FAULTS.get(label)
         truth = "" if fault is None else f"{fault.cause} {fault.amplitude:.4f} {fault.unit}"
-        given = [{"class": (), "rivals": (), **c, "effect": f"{c['effect']} (given)"} for c in answer["given"]]
-        rows = list(map(_cause, [*given, *answer["causes"]])) or [("none", "", "")]
+        alone = {"equivalence_class": (), "rivals": ()}
+        initial = [{**alone, **c, "effect": f"{c['effect']} (given)"} for c in answer["initial_causes"]]
+        rows = list(map(_cause, [*initial, *answer["causes"]])) or [("none", "", "")]
         for k, row in enumerate(rows):
             first = (label, answer["verdict"]) if k == 0 else ("", "")
             rows_table.add_row(*first, *map(escape, row), escape(truth) if k == 0 else "")
@@ -249,7 +251,7 @@ def _blind_table(answers: dict[str, Any]) -> Any:
 
 def _cause(cause: dict[str, Any]) -> tuple[str, str, str]:
     """Return a cause's name, the causes confounded with it, and its amplitude."""
-    others = {*cause["class"], *(r["effect"] for r in cause["rivals"])} - {cause["effect"]}
+    others = {*cause["equivalence_class"], *(r["effect"] for r in cause["rivals"])} - {cause["effect"]}
     low, high = cause["ci95"]
     return (
         cause["effect"],

@@ -30,14 +30,14 @@ SHEET_THICKNESS_M = 1e-3  # of all sheets
 def std_without_common_error(answer: dict[str, Any], ends: Sequence[float], value: float) -> float:
     """Return the standard error of an interval, less the common error that newer answers include."""
     low, high = ends
-    variance = ((high - low) / (2 * Z_95)) ** 2 - (answer.get("common_error", 0.0) * value) ** 2
+    variance = ((high - low) / (2 * Z_95)) ** 2 - (answer.get("common_relative_error", 0.0) * value) ** 2
     return max(variance, 0.0) ** 0.5
 
 
 def amplitude_errors(truth: dict[str, Any], answer: dict[str, Any]) -> Iterator[tuple[str, float, float]]:
     """Yield ("amplitudes", relative error, its standard error) of each effect that is named outright."""
-    asked = scores.wanted(truth)
-    for cause, wanted in zip(scores._matched(scores.named(answer), asked), asked, strict=True):
+    asked = scores.list_expected_effects(truth)
+    for cause, wanted in zip(scores.match_causes(scores.list_named_causes(answer), asked), asked, strict=True):
         if cause is not None and cause.best in wanted.names and wanted.comparable:
             std = std_without_common_error(answer, cause.ci95, cause.amplitude) / abs(wanted.amplitude)
             yield "amplitudes", cause.amplitude / wanted.amplitude - 1, std
@@ -45,7 +45,7 @@ def amplitude_errors(truth: dict[str, Any], answer: dict[str, Any]) -> Iterator[
 
 def fabric_errors(truth: dict[str, Any], answer: dict[str, Any]) -> Iterator[tuple[str, float, float]]:
     """Yield (name, error of the logarithm, its standard error) of the fabric's fitted values in null cases."""
-    if truth["family"] not in scores.NULLS:
+    if truth["family"] not in scores.NULL_FAMILIES:
         return
     for name, fabric_name in FITTED_FABRIC_VALUES.items():
         if (row := answer.get("parameters", {}).get(name)) is not None:

@@ -32,11 +32,11 @@ PRINTED_CAUSE_KEYS = (
     "amplitude",
     "ci95",
     "noise_ci95",
-    "told_by",
+    "effective_motions",
     "motions_disagree",
-    "class",
+    "equivalence_class",
     "rivals",
-    "placebo",
+    "permutation_test",
 )
 
 
@@ -95,8 +95,8 @@ def main(arguments: list[str] | None = None) -> int:
     for row in sorted(answer.search.scores, key=lambda r: -r.expected_gain)[:8]:
         print(f"score: {row.hypothesis.name:22} {row.amplitude:9.3g} +- {row.std:.2g}  {row.decision}")
     for row in answer.content["lack_of_fit"]:
-        if row["lacking"]:
-            print(f"lack of fit: {row['motion']} {row['kind']} {row['ratio']:.2f}")
+        if row["is_significant"]:
+            print(f"lack of fit: {row['motion']} {row['kind']} {row['rms_ratio']:.2f}")
     print(answer.verdict, "and something unexplained" * answer.content["also_unexplained"])
     for cause in answer.content["causes"]:
         print("named:", json.dumps({key: cause[key] for key in PRINTED_CAUSE_KEYS}))
