@@ -12,9 +12,9 @@ import torch
 
 import torchcloth as tc
 from torchcloth import recordings as rec
-from torchcloth.episodes.unknowns import available
+from torchcloth.episodes.unknowns import find_scalar_parameters
 from torchcloth.robots import replay
-from torchcloth.training.studies.synthetic_sheets import on_grid, readings
+from torchcloth.training.studies.synthetic_sheets import interpolate_on_grid, simulate_readings
 
 WIDTH, HEIGHT = 0.30, 0.20  # m, between the jaws and along them
 THICKNESS = 1e-3  # m
@@ -100,7 +100,7 @@ def flat(mesh: tc.meshes.Mesh) -> torch.Tensor:
 
 def at(x: np.ndarray, shape: tuple[int, int], uv: np.ndarray) -> np.ndarray:
     """Positions [N, 3] m of material points on a grid of vertices."""
-    return on_grid(x, shape, uv / [WIDTH, HEIGHT])
+    return interpolate_on_grid(x, shape, uv / [WIDTH, HEIGHT])
 
 
 def record(
@@ -119,7 +119,7 @@ def record(
         moves = replay(bare)
         state = truth.settle(truth.state(flat(truth.mesh)), moves, duration=0.6)
         out = truth(state, moves, times.tolist(), dt=0.6 * truth.stable_step())
-    forces = {name: readings(out, name, knots, FORCE_NOISE, rng) for name in motion}
+    forces = {name: simulate_readings(out, name, knots, FORCE_NOISE, rng) for name in motion}
     x = out.x[np.searchsorted(times, frames + setting.clock)].numpy()
     clouds = [_cloud(frame, setting, rng) for frame in x]
     first = at(out.x[0].numpy(), setting.resolution, np.asarray(mesh.uv))
@@ -182,5 +182,5 @@ def model(recording: rec.Recording, resolution: tuple[int, int] = FIT, **start: 
     """The cloth of an episode with some start values, by default wrong ones."""
     found = cloth(Fabric(membrane=150.0, poisson=0.2, density=recording.cloth.areal_density), resolution)
     for name, value in start.items():
-        found.get_submodule(available(found)[name]).set(value)
+        found.get_submodule(find_scalar_parameters(found)[name]).set(value)
     return found
