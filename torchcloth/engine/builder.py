@@ -344,7 +344,7 @@ class BendingLoop:
         self._stress = stress if self._stress is None else self.loop.call("copy15", stress, into=self._stress)
 
     def close(self) -> None:
-        """Add the transposed stencil of the sum of all to the transposed stencil."""
+        """Apply the transposed stencil to the sum of all stresses."""
         if self._moment is not None:
             _ = self.curvature
             inputs = self._derivatives, self._normal_and_curvature[:4], self._area, self._moment
