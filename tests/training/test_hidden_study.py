@@ -68,7 +68,7 @@ def test_the_truth_is_opened_after_the_answer_and_nothing_is_told(called, tmp_pa
 
 def test_what_the_catalogue_does_not_know_is_asked_whether_it_shows(called, tmp_path):
     seed = next(s for s in range(20) if case_sampling.draw_case(s).family == "outside")
-    assert hidden.one(tmp_path, "001", seed, False)["sizes"][0]["name"] == "x.jet"
+    assert hidden.run_case(tmp_path, "001", seed, False)["sizes"][0]["name"] == "x.jet"
     assert [c[0] for c in called].index("visibility") > [c[0] for c in called].index("reveal_truth")
 
 
@@ -172,11 +172,11 @@ def test_a_round_that_is_stopped_in_its_first_case_keeps_its_secret(called, tmp_
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patch:
-        patch.setattr(hidden, "answered", stopped)
+        patch.setattr(hidden, "diagnose_episodes", stopped)
         with pytest.raises(KeyboardInterrupt):
             hidden.run(options(tmp_path, cases=1))
     secret = json.loads((tmp_path / "s" / "study.json").read_text())["secret"]
-    assert hidden.drawn(options(tmp_path)).settings["secret"] == secret
+    assert hidden.draw_round(options(tmp_path)).settings["secret"] == secret
 
 
 def test_what_another_version_has_begun_is_begun_anew(called, tmp_path, monkeypatch):
@@ -190,46 +190,46 @@ def test_what_another_version_has_begun_is_begun_anew(called, tmp_path, monkeypa
         return usual(command)
 
     monkeypatch.setattr(hidden, "_run", run)
-    assert hidden.answered([tmp_path / "e1"], tmp_path / "a") == ANSWER
+    assert hidden.diagnose_episodes([tmp_path / "e1"], tmp_path / "a") == ANSWER
 
 
 def test_secrets_are_kept_fresh_ones_differ_and_development_is_no_secret(tmp_path):
-    one, two = (hidden.drawn(options(tmp_path / name)) for name in "ab")
+    one, two = (hidden.draw_round(options(tmp_path / name)) for name in "ab")
     assert one.settings["secret"] != two.settings["secret"]
-    assert len(one.seeds) == hidden.CASES
+    assert len(one.seeds) == hidden.DEFAULT_CASES
     assert min(one.seeds.values()) >= 100_000
-    dev = hidden.drawn(options(tmp_path, dev=True, cases=5))
+    dev = hidden.draw_round(options(tmp_path, dev=True, cases=5))
     assert list(dev.seeds.values()) == [0, 1, 2, 3, 4]
     assert dev.settings["secret"] is None
     for wrong in ({"cases": 0}, {"dev": True, "cases": 1001}):
         with pytest.raises(InvalidInput, match="--cases"):
-            hidden.drawn(options(tmp_path, **wrong))
+            hidden.draw_round(options(tmp_path, **wrong))
 
 
 def test_an_answer_that_is_none_says_how_it_ended(monkeypatch, tmp_path):
     for code, word in ((2, "refused"), (-11, "failed")):
         ended = Namespace(returncode=code, stdout="", stderr="progress\npoints.npz: t does not increase")
         monkeypatch.setattr(hidden, "_run", lambda command, ended=ended: ended)
-        found = hidden.answered([tmp_path / "e1"], tmp_path / word)
-        assert found == {
+        answer = hidden.diagnose_episodes([tmp_path / "e1"], tmp_path / word)
+        assert answer == {
             word: "points.npz: t does not increase",
             "stderr": ["progress", "points.npz: t does not increase"],
         }
-        assert json.loads((tmp_path / word / "diagnosis.json").read_text()) == found
+        assert json.loads((tmp_path / word / "diagnosis.json").read_text()) == answer
 
 
 def test_an_answer_stays_once_its_truth_may_be_open(monkeypatch, tmp_path):
     (tmp_path / "a").mkdir()
     (tmp_path / "a" / "diagnosis.json").write_text(json.dumps(ANSWER))
     monkeypatch.delattr(hidden, "_run")
-    assert hidden.answered([tmp_path / "e1"], tmp_path / "a") == ANSWER
+    assert hidden.diagnose_episodes([tmp_path / "e1"], tmp_path / "a") == ANSWER
 
 
 def test_what_the_system_kills_is_no_answer(monkeypatch, tmp_path):
     """For want of memory; a crash of its own is one that failed."""
     monkeypatch.setattr(hidden, "_run", lambda _: Namespace(returncode=-9, stdout="", stderr=""))
     with pytest.raises(KeyboardInterrupt):
-        hidden.answered([tmp_path / "e1"], tmp_path / "a")
+        hidden.diagnose_episodes([tmp_path / "e1"], tmp_path / "a")
     assert not (tmp_path / "a").exists()
 
 
@@ -253,8 +253,8 @@ def test_a_diagnosis_that_was_stopped_is_no_answer_and_goes_on(monkeypatch, tmp_
 
     monkeypatch.setattr(hidden, "_run", run)
     with pytest.raises(KeyboardInterrupt):
-        hidden.answered([tmp_path / "e1"], tmp_path / "a")
-    assert hidden.answered([tmp_path / "e1"], tmp_path / "a") == ANSWER
+        hidden.diagnose_episodes([tmp_path / "e1"], tmp_path / "a")
+    assert hidden.diagnose_episodes([tmp_path / "e1"], tmp_path / "a") == ANSWER
     assert ["--resume" in command for command in commands] == [False, True]
 
 
@@ -271,22 +271,25 @@ def test_experiments_are_made_of_the_same_case_and_answered_with_all_episodes(ca
         return f"{arguments[-1]}/e9: {arguments[1]}\n"
 
     asked = ANSWER | {"next_experiment": {"motion": "turn", "heading": 90.0, "separates": ["a", "b"]}}
-    found = hidden.experiments(tmp_path, "007", make, [tmp_path / "e1"], asked, 19)
+    answer = hidden.answer_after_experiments(tmp_path, "007", make, [tmp_path / "e1"], asked, 19)
     assert made[0] == ("--motion", "turn", "--heading", "95.0", "--out", str(tmp_path / "episodes" / "007-proposed"))
     assert made[1][0] == "--motion"
     assert called[0][2:] == ["diagnose", "e1", "e9", "--out", "007-proposed"]
-    assert found == {"proposed": ANSWER, "random": ANSWER}
-    assert hidden.experiments(tmp_path, "008", make, [], ANSWER, 19) == {"proposed": None, "random": None}
+    assert answer == {"proposed": ANSWER, "random": ANSWER}
+    assert hidden.answer_after_experiments(tmp_path, "008", make, [], ANSWER, 19) == {"proposed": None, "random": None}
 
 
 def test_a_case_that_needs_no_experiment_tells_nothing_of_experiments():
     seed = next(s for s in range(20) if case_sampling.draw_case(s).family == "next experiment")
     truth = reveal_truth.reveal_truth(case_sampling.draw_case(seed))
     (name,) = (e["hypothesis"] for e in truth["effects"] if not e["is_enabling"])
-    cause = {"effect": name, "amplitude": 1.0, "class": [name], "rivals": [], "ci95": [0.0, 2.0]}
+    cause = {"effect": name, "amplitude": 1.0, "equivalence_class": [name], "rivals": [], "ci95": [0.0, 2.0]}
     sure, unsure = ANSWER | {"causes": [cause]}, ANSWER | {"causes": [cause | {"rivals": [{"effect": "my.own"}]}]}
     none = {"proposed": None, "random": None}
-    resolved = lambda answer, later: hidden.scored("1", {"truth": truth, "answer": answer, "next": later})["resolved"]  # noqa: E731
+
+    def resolved(answer, later):
+        return hidden.score_answer("1", {"truth": truth, "answer": answer, "next": later})["resolved"]
+
     assert resolved(sure, none) is None
     partly = ANSWER | {"causes": [*sure["causes"], *unsure["causes"]]}
     assert resolved(partly, {"proposed": sure, "random": sure}) is None
@@ -302,10 +305,10 @@ def test_wrong_options_are_one_line(tmp_path, capsys):
 
 
 def test_the_small_round_is_always_the_same(tmp_path):
-    small = hidden.drawn(options(tmp_path, fast=True))
-    assert tuple(small.seeds.values()) == hidden.FAST
-    assert min(hidden.FAST) >= 100_000
-    assert len(hidden.drawn(options(tmp_path, fast=True, seed=4, cases=9)).seeds) == 9
-    count = len(hidden.FAST)
+    small = hidden.draw_round(options(tmp_path, fast=True))
+    assert tuple(small.seeds.values()) == hidden.FAST_SEEDS
+    assert min(hidden.FAST_SEEDS) >= 100_000
+    assert len(hidden.draw_round(options(tmp_path, fast=True, seed=4, cases=9)).seeds) == 9
+    count = len(hidden.FAST_SEEDS)
     with pytest.raises(InvalidInput, match=f"--cases; got {count + 1}; expected at most {count}"):
-        hidden.drawn(options(tmp_path, fast=True, cases=count + 1))
+        hidden.draw_round(options(tmp_path, fast=True, cases=count + 1))

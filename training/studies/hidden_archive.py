@@ -6,7 +6,8 @@ line is one case: its ``name``, and what ``studies hidden`` wrote to ``cases/NAM
 
 Old files keep the keys of their time. ``RENAMED_KEYS`` is the only place that knows them.
 
-    python -m torchcloth.training.studies.hidden_archive DIR COMMIT docs/validation/blind-rounds/answers    # DIR: --out of the study
+    # DIR: --out of the study
+    python -m torchcloth.training.studies.hidden_archive DIR COMMIT docs/validation/blind-rounds/answers
 """
 
 from __future__ import annotations
@@ -24,7 +25,7 @@ from torchcloth._utils.files import write_atomically
 from torchcloth.errors import InvalidInput
 
 SUFFIX = ".jsonl.xz"
-CURRENT_SCHEMA = 2  # of the keys that cases are written with today
+CURRENT_SCHEMA = 3  # of the keys that cases are written with today
 
 # By schema of the file: old key -> new key, to come from this schema to the next one. A key is given with its path from
 # the case's root, joined by dots; lists in between are not counted, so "answer.causes.rivals" is a key of each cause.
@@ -40,6 +41,23 @@ RENAMED_KEYS: dict[int, dict[str, str]] = {
         "sizes.pulls": "force_rms_n",
         "sizes.left_moves": "unexplained_displacement_rms_m",
         "sizes.left_pulls": "unexplained_force_rms_n",
+    },
+    2: {
+        "answer.causes.class": "equivalence_class",
+        "answer.causes.gain_mm": "rms_removed_mm",
+        "answer.causes.placebo": "permutation_test",
+        "answer.causes.placebo.chance": "quantile_95",
+        "answer.causes.says": "description",
+        "answer.causes.share_of_explainable": "explained_fraction",
+        "answer.causes.told_by": "effective_motions",
+        "answer.common_error": "common_relative_error",
+        "answer.drifts": "force_drifts",
+        "answer.floor": "noise_floor",
+        "answer.gain.ci95": "explained_fraction_ci95",
+        "answer.gain.floor": "noise_floor",
+        "answer.gain.per_motion.ci95": "explained_fraction_ci95",
+        "answer.given": "initial_causes",
+        "answer.residual": "residual_force",
     },
 }
 ANSWER_PATHS: dict[tuple[str, ...], tuple[str, ...]] = {

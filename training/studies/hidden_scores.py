@@ -1,7 +1,7 @@
-"""How answers to hidden cases are judged: pure functions of what was hidden and what was answered.
+"""Scores of answers to hidden cases: pure functions of the truth and the answer.
 
-A truth is what validation.hidden.reveal_truth prints; an answer is the content of diagnosis.json, or ``{"refused": text}``
-where the command refused the recordings, or ``{"failed": text}`` where it ended otherwise.
+A truth is what ``validation.hidden.reveal_truth`` prints. An answer is the content of diagnosis.json. It is
+``{"refused": text}`` if the command refused the recordings, and ``{"failed": text}`` if it ended otherwise.
 """
 
 from __future__ import annotations
@@ -12,198 +12,235 @@ from typing import Any, NamedTuple
 
 Truth = Mapping[str, Any]
 Answer = Mapping[str, Any]
-WITH_EFFECT = ("single", "double", "confounded", "next experiment")
-NULLS = ("null", "hard null")
-UNDECIDED = ("unresolvable", "undecided", "inconclusive")
-MOVED, PULLED = 3e-4, 10e-3  # m and N, RMS: of an effect that shows
+EFFECT_FAMILIES = ("single", "double", "confounded", "next experiment")
+NULL_FAMILIES = ("null", "hard null")
+UNDECIDED_KEYS = ("unresolvable", "undecided", "inconclusive")
+MIN_DISPLACEMENT_RMS_M = 3e-4  # of an observable effect
+MIN_FORCE_RMS_N = 10e-3  # of an observable effect
 
 
-class Wanted(NamedTuple):
-    """One hidden effect that should be found."""
+class ExpectedEffect(NamedTuple):
+    """One hidden effect that should be identified.
 
-    name: str  # the generator's
-    names: frozenset[str]  # any of them is right
-    amplitude: float  # by the library's sign
+    Attributes:
+        name: in the generator.
+        names: any of them is right.
+        amplitude: with the library's sign.
+        comparable: whether amplitudes of truth and answer can be compared.
+        hypothesis: the library's name with its axis; "" if it has none.
+    """
+
+    name: str
+    names: frozenset[str]
+    amplitude: float
     comparable: bool
-    hypothesis: str  # the library's name with its axis; "" where it has none
+    hypothesis: str
 
 
-class Named(NamedTuple):
-    """One cause of an answer."""
+class NamedCause(NamedTuple):
+    """One cause of an answer.
 
-    whole: str  # with its axis
-    alike: frozenset[str]  # with what no such data tell from it, itself included
-    all: frozenset[str]  # with rivals, too
+    Attributes:
+        hypothesis: name with its axis.
+        confounded: the cause and all that no such data distinguish from it.
+        candidates: these and the rivals.
+        amplitude: in the library's unit.
+        ci95: 95 % interval of the amplitude.
+    """
+
+    hypothesis: str
+    confounded: frozenset[str]
+    candidates: frozenset[str]
     amplitude: float
     ci95: tuple[float, float]
 
     @property
-    def best(self) -> str:
-        """Without its axis."""
-        return effect(self.whole)
+    def name(self) -> str:
+        """Name without the axis."""
+        return effect(self.hypothesis)
 
     @property
-    def alone(self) -> bool:
-        """Nothing else is said to be possible."""
-        return len(self.all) == 1
+    def stands_alone(self) -> bool:
+        """Whether the answer says that nothing else is possible."""
+        return len(self.candidates) == 1
 
 
 def effect(name: str) -> str:
-    """A cause's name without its axis."""
+    """Return a cause's name without its axis."""
     return name.partition("[")[0]
 
 
-def named(answer: Answer) -> list[Named]:
-    """The causes of an answer."""
-    found = []
+def list_named_causes(answer: Answer) -> list[NamedCause]:
+    """Return the causes of an answer."""
+    out = []
     for cause in answer.get("causes", ()):
-        alike = frozenset(map(effect, [cause["effect"], *cause["class"]]))
+        confounded = frozenset(map(effect, [cause["effect"], *cause["equivalence_class"]]))
         rivals = frozenset(effect(r["effect"]) for r in cause["rivals"])
         low, high = cause["ci95"]
-        found.append(Named(cause["effect"], alike, alike | rivals, cause["amplitude"], (low, high)))
-    return found
+        out.append(NamedCause(cause["effect"], confounded, confounded | rivals, cause["amplitude"], (low, high)))
+    return out
 
 
-def wanted(truth: Truth) -> list[Wanted]:
-    """What should be found; what is too small to matter, or beyond the catalogue, is not."""
-    if truth["family"] in NULLS:
+def list_expected_effects(truth: Truth) -> list[ExpectedEffect]:
+    """Return the effects that should be identified: not those that are irrelevant or outside the catalogue."""
+    if truth["family"] in NULL_FAMILIES:
         return []
     return [
-        Wanted(e["name"], frozenset(e["names"]), e["amplitude"] * (e["sign"] or 1.0), bool(e["sign"]), e["hypothesis"])
+        ExpectedEffect(
+            e["name"], frozenset(e["names"]), e["amplitude"] * (e["sign"] or 1.0), bool(e["sign"]), e["hypothesis"]
+        )
         for e in truth["effects"]
         if e["names"] and not e["is_enabling"]
     ]
 
 
-def fine(truth: Truth) -> frozenset[str]:
-    """Names that are no error."""
+def true_names(truth: Truth) -> frozenset[str]:
+    """Return the names that are not an error."""
     return frozenset(n for e in truth["effects"] for n in e["names"])
 
 
-def judged(truth: Truth, answer: Answer) -> dict[str, Any]:
-    """One case: what counts in the tables."""
-    causes, asked, right = named(answer), wanted(truth), fine(truth)
+def score_case(truth: Truth, answer: Answer) -> dict[str, Any]:
+    """Score one case; return what the tables count."""
+    causes, expected, right = list_named_causes(answer), list_expected_effects(truth), true_names(truth)
     out: dict[str, Any] = {
         "family": truth["family"],
         "kind": truth["kind"],
         "hidden": [e["name"] for e in truth["effects"]],
-        "verdict": verdict(answer),
-        "named": [" | ".join([c.best, *sorted(c.all - {c.best})]) for c in causes],
-        "wrong": any(c.alone and c.best not in right for c in causes),
-        "spurious": sum(not c.all & right for c in causes),
-        "sizes": [len(c.all) for c in causes],
+        "verdict": outcome(answer),
+        "named": [" | ".join([c.name, *sorted(c.candidates - {c.name})]) for c in causes],
+        "wrong": any(c.stands_alone and c.name not in right for c in causes),
+        "spurious": sum(not c.candidates & right for c in causes),
+        "sizes": [len(c.candidates) for c in causes],
         "no_answer": "refused" in answer or "failed" in answer,
-        "unexplained": unexplained(answer),
+        "unexplained": is_unexplained(answer),
     }
-    if asked:
-        found = _matched(causes, asked)
+    if expected:
+        matches = match_causes(causes, expected)
         out |= {
-            "sought": [w.name for w in asked],
-            "found": [c is not None and bool(c.alike & w.names) for c, w in zip(found, asked, strict=True)],
-            "covered": [c is not None for c in found],
-            "said_invisible": [_invisible(answer, w) for w in asked],
-            "amplitudes": [_amplitude(c, w) for c, w in zip(found, asked, strict=True)],
-            "ways": [_way(c, w) for c, w in zip(found, asked, strict=True)],
+            "expected": [w.name for w in expected],
+            "identified": [
+                c is not None and bool(c.confounded & w.names) for c, w in zip(matches, expected, strict=True)
+            ],
+            "covered": [c is not None for c in matches],
+            "is_unresolvable": [_is_unresolvable(answer, w) for w in expected],
+            "amplitudes": [_amplitude(c, w) for c, w in zip(matches, expected, strict=True)],
+            "directions_right": [_is_direction_right(c, w) for c, w in zip(matches, expected, strict=True)],
         }
-    return out | {"right": _right(truth, answer, causes, asked, out)}
+    return out | {"right": _is_right(truth, answer, causes, expected, out)}
 
 
-def shows(truth: Truth, sizes: Sequence[Mapping[str, Any]] | None) -> list[bool] | None:
-    """Whether each effect that is there for its own sake changes what is recorded beside what the fabric's numbers do.
+def observable_effects(truth: Truth, sizes: Sequence[Mapping[str, Any]] | None) -> list[bool] | None:
+    """Whether each effect changes the recording by more than a change of the fabric's parameters could explain.
 
-    ``sizes`` is what validation.hidden.visibility prints; what is not there moves no cloth and is seen as it is. None: not
-    known.
+    Effects that only enable another one are left out.
+
+    Args:
+        truth: of the case.
+        sizes: output of ``validation.hidden.visibility``. Effects that it does not list move no cloth, so they count as
+            observable. None: not known.
     """
     if sizes is None:
         return None
-    left = {row["name"]: row["unexplained_displacement_rms_m"] > MOVED or row["unexplained_force_rms_n"] > PULLED for row in sizes}
-    return [left.get(e["name"], True) for e in truth["effects"] if not e["is_enabling"]]
+    is_observable = {
+        row["name"]: row["unexplained_displacement_rms_m"] > MIN_DISPLACEMENT_RMS_M
+        or row["unexplained_force_rms_n"] > MIN_FORCE_RMS_N
+        for row in sizes
+    }
+    return [is_observable.get(e["name"], True) for e in truth["effects"] if not e["is_enabling"]]
 
 
-def verdict(answer: Answer) -> str:
-    """With the ways not to answer among them."""
+def outcome(answer: Answer) -> str:
+    """Return the verdict, or "refused" or "failed" if there is no answer."""
     return next((word for word in ("refused", "failed") if word in answer), str(answer.get("verdict")))
 
 
-def _matched(causes: Sequence[Named], asked: Sequence[Wanted]) -> list[Named | None]:
-    """The cause that stands for each effect, one for one: as many as can be by their names, then by classes, then by
-    rivals, whatever order they are listed in.
+def match_causes(causes: Sequence[NamedCause], expected: Sequence[ExpectedEffect]) -> list[NamedCause | None]:
+    """Match each effect with at most one cause.
+
+    As many as possible match by name, then by confounded names, then by rivals. The order of the lists is irrelevant.
     """
 
-    def grade(found: Sequence[Named | None]) -> tuple[int, int, int]:
-        pairs = [(c, w.names) for c, w in zip(found, asked, strict=True) if c is not None]
-        sets = (lambda c: {c.best}, lambda c: c.alike, lambda c: c.all)
+    def grade(matches: Sequence[NamedCause | None]) -> tuple[int, int, int]:
+        pairs = [(c, w.names) for c, w in zip(matches, expected, strict=True) if c is not None]
+        sets = (lambda c: {c.name}, lambda c: c.confounded, lambda c: c.candidates)
         return tuple(sum(bool(part(c) & names) for c, names in pairs) for part in sets)  # type: ignore[return-value]
 
-    possible = permutations([*causes, *[None] * len(asked)], len(asked))
+    possible = permutations([*causes, *[None] * len(expected)], len(expected))
     best = max(possible, key=grade)
-    return [c if c is not None and c.all & w.names else None for c, w in zip(best, asked, strict=True)]
+    return [c if c is not None and c.candidates & w.names else None for c, w in zip(best, expected, strict=True)]
 
 
-def _invisible(answer: Answer, w: Wanted) -> bool:
-    """The answer says that these data do not show it."""
+def _is_unresolvable(answer: Answer, w: ExpectedEffect) -> bool:
+    """Whether the answer says that these data do not show the effect."""
     return any(effect(row["effect"]) in w.names for row in answer.get("unresolvable", ()))
 
 
-def _amplitude(cause: Named | None, w: Wanted) -> dict[str, Any] | None:
-    """Error as a share, and whether the interval holds the truth; None where they cannot be compared."""
-    if cause is None or cause.best not in w.names or not w.comparable:
+def _amplitude(cause: NamedCause | None, w: ExpectedEffect) -> dict[str, Any] | None:
+    """Return the relative error, and whether the interval contains the truth; None if they cannot be compared."""
+    if cause is None or cause.name not in w.names or not w.comparable:
         return None
     low, high = cause.ci95
     return {"error": cause.amplitude / w.amplitude - 1, "inside": low <= w.amplitude <= high}
 
 
-def _way(cause: Named | None, w: Wanted) -> bool | None:
-    """Along the axis that is hidden, and of the sign; None of what is not named outright."""
-    if cause is None or cause.best not in w.names:
+def _is_direction_right(cause: NamedCause | None, w: ExpectedEffect) -> bool | None:
+    """Whether axis and sign are right; None if the effect is not named outright."""
+    if cause is None or cause.name not in w.names:
         return None
-    return cause.whole == w.hypothesis and (not w.comparable or cause.amplitude * w.amplitude > 0)
+    return cause.hypothesis == w.hypothesis and (not w.comparable or cause.amplitude * w.amplitude > 0)
 
 
-def _right(truth: Truth, answer: Answer, causes: Sequence[Named], asked: Sequence[Wanted], out: Mapping) -> bool:
-    """The family's own question, answered well."""
+def _is_right(
+    truth: Truth, answer: Answer, causes: Sequence[NamedCause], expected: Sequence[ExpectedEffect], out: Mapping
+) -> bool:
+    """Whether the answer is right for the question that the case's family asks."""
     family = truth["family"]
     if out["no_answer"] and family != "fault":
         return False
-    if family in NULLS:
-        return not causes and verdict(answer) != "invalid_data"
+    if family in NULL_FAMILIES:
+        return not causes and outcome(answer) != "invalid_data"
     if family == "single":
-        return out["found"][0]
+        return out["identified"][0]
     if family == "double":
-        return all(out["found"])
+        return all(out["identified"])
     if family == "outside":
-        return unexplained(answer)
+        return is_unexplained(answer)
     if family == "fault":
-        return verdict(answer) == "invalid_data" or _only(causes, truth["right_for_fault"])
-    return said_alike(truth, answer, causes)
+        return outcome(answer) == "invalid_data" or _are_all_among(causes, truth["right_for_fault"])
+    return is_answered_as_confounded(truth, answer, causes)
 
 
-def unexplained(answer: Answer) -> bool:
-    """The answer says that something is left over which no known cause mends."""
+def is_unexplained(answer: Answer) -> bool:
+    """Whether the answer says that a lack of fit remains which no known cause explains."""
     return answer.get("verdict") == "unexplained" or bool(answer.get("also_unexplained"))
 
 
-def _only(causes: Sequence[Named], names: Sequence[str]) -> bool:
-    return bool(causes) and all(c.best in names for c in causes)
+def _are_all_among(causes: Sequence[NamedCause], names: Sequence[str]) -> bool:
+    return bool(causes) and all(c.name in names for c in causes)
 
 
-def said_alike(truth: Truth, answer: Answer, causes: Sequence[Named]) -> bool:
-    """A confounded case is answered as such.
+def is_answered_as_confounded(truth: Truth, answer: Answer, causes: Sequence[NamedCause]) -> bool:
+    """Whether a confounded case is answered as such.
 
-    Either the effect is named with something else beside it, and nothing false alone; or nothing is named and the
-    effect is among what these data cannot decide. Where the data might tell after all, its name alone is right, too.
+    Either the effect is named together with another candidate, and no false cause stands alone. Or nothing is named,
+    and the effect is listed among those that these data cannot decide. If the data may separate the two after all, the
+    effect's name alone is also right.
     """
-    names, like = frozenset(n for w in wanted(truth) for n in w.names), truth["confounded"] or {}
+    names, confounding = frozenset(n for w in list_expected_effects(truth) for n in w.names), truth["confounded"] or {}
     if not causes:
-        listed = [row["effect"] if isinstance(row, Mapping) else row for k in UNDECIDED for row in answer.get(k, ())]
+        listed = [
+            row["effect"] if isinstance(row, Mapping) else row for k in UNDECIDED_KEYS for row in answer.get(k, ())
+        ]
         return any(effect(name) in names for name in listed)
-    if any(c.alone and c.best not in fine(truth) for c in causes):
+    if any(c.stands_alone and c.name not in true_names(truth) for c in causes):
         return False
-    return any(c.all & names and (len(c.all) > 1 or like.get("may_be_separable", False)) for c in causes)
+    return any(
+        c.candidates & names and (len(c.candidates) > 1 or confounding.get("may_be_separable", False)) for c in causes
+    )
 
 
-def told_apart(truth: Truth, answer: Answer) -> bool:
-    """The effect is named alone, and nothing false is."""
-    names, causes = frozenset(n for w in wanted(truth) for n in w.names), named(answer)
-    false = any(c.alone and c.best not in fine(truth) for c in causes)
-    return not false and any(c.alone and c.best in names for c in causes)
+def is_resolved(truth: Truth, answer: Answer) -> bool:
+    """Whether the effect stands alone, and no false cause does."""
+    names, causes = frozenset(n for w in list_expected_effects(truth) for n in w.names), list_named_causes(answer)
+    false = any(c.stands_alone and c.name not in true_names(truth) for c in causes)
+    return not false and any(c.stands_alone and c.name in names for c in causes)

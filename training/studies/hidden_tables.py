@@ -1,4 +1,4 @@
-"""The hidden round as tables: for a terminal, and as Markdown for the docs."""
+"""Tables of a hidden round: for a terminal, and as Markdown for the docs."""
 
 from __future__ import annotations
 
@@ -11,41 +11,45 @@ import numpy as np
 
 from . import hidden_rates
 from .fabric_tables import NO_VALUE, make_table
-from .hidden_rates import Mark, Rate, further, marks
-from .hidden_scores import NULLS
+from .hidden_rates import Rate, Target, compute_further_rates, compute_targets
+from .hidden_scores import NULL_FAMILIES
 
-LONG = 240.0  # s, that a diagnosis of this size may take
-HEADINGS = ("figure", "must", "aim", "is", "95 %", "of", "")
+MAX_DIAGNOSIS_S = 240.0  # budget of a diagnosis of this size
+TARGET_COLUMNS = ("figure", "must", "aim", "is", "95 %", "of", "")
 
 
-def show(cases: Sequence[Mapping[str, Any]]) -> None:
-    """Marks, further rates, and every case."""
+def print_tables(cases: Sequence[Mapping[str, Any]]) -> None:
+    """Print the targets, further rates, and every case."""
     from rich.console import Console
 
     console = Console(highlight=False)
     console.width = max(console.width, 130)
-    console.print(_filled("What must show", HEADINGS, [_mark(m) for m in marks(cases)]))
-    console.print(_filled("Further", ("figure", "is", "95 %", "of"), [_rate(*row) for row in further(cases)]))
-    console.print(_filled("Every case", CASE, [_case(c) for c in cases], left=7))
-    console.print(seconds(cases), markup=False)
+    console.print(_fill_table("What must show", TARGET_COLUMNS, [_target_row(m) for m in compute_targets(cases)]))
+    console.print(
+        _fill_table(
+            "Further", ("figure", "is", "95 %", "of"), [_rate_row(*row) for row in compute_further_rates(cases)]
+        )
+    )
+    console.print(_fill_table("Every case", CASE_COLUMNS, [_case_row(c) for c in cases], left=7))
+    console.print(describe_durations(cases), markup=False)
 
 
-def markdown(cases: Sequence[Mapping[str, Any]]) -> str:
-    """The same, to be pasted."""
+def to_markdown(cases: Sequence[Mapping[str, Any]]) -> str:
+    """Return the same tables as Markdown."""
     parts = [
-        _lines(HEADINGS, [_mark(m) for m in marks(cases)]),
-        _lines(("figure", "is", "95 %", "of"), [_rate(*row) for row in further(cases)]),
-        _lines(CASE, [_case(c) for c in cases]),
+        _markdown_table(TARGET_COLUMNS, [_target_row(m) for m in compute_targets(cases)]),
+        _markdown_table(("figure", "is", "95 %", "of"), [_rate_row(*row) for row in compute_further_rates(cases)]),
+        _markdown_table(CASE_COLUMNS, [_case_row(c) for c in cases]),
     ]
-    return "\n\n".join(parts) + f"\n\n{seconds(cases)}\n"
+    return "\n\n".join(parts) + f"\n\n{describe_durations(cases)}\n"
 
 
-def beside(rounds: Mapping[str, Sequence[Mapping[str, Any]]]) -> str:
-    """Markdown with a column for each round, with its number of cases, and one for all their cases together."""
-    columns = [_figures(cases) for cases in (*rounds.values(), [c for cases in rounds.values() for c in cases])]
+def tabulate_rounds(rounds: Mapping[str, Sequence[Mapping[str, Any]]]) -> str:
+    """Return Markdown with a column for each round and one for the cases of all rounds."""
+    columns = [_format_figures(cases) for cases in (*rounds.values(), [c for cases in rounds.values() for c in cases])]
     rows = [(label, *(c[label][0] for c in columns), columns[-1][label][1]) for label in columns[-1]]
     counts = [f"{name} ({len(cases)})" for name, cases in rounds.items()]
-    return _lines(("figure", *counts, "together", "95 %"), rows)
+    return _markdown_table(("figure", *counts, "together", "95 %"), rows)
 
 
 def rounds_csv(rounds: Mapping[str, Sequence[Mapping[str, Any]]]) -> str:
@@ -54,7 +58,7 @@ def rounds_csv(rounds: Mapping[str, Sequence[Mapping[str, Any]]]) -> str:
     writer = csv.writer(file, lineterminator="\n")
     writer.writerow(("round", "cases", "figure", "value", "hits", "of", "low_95", "high_95"))
     for name, cases in rounds.items():
-        for label, value in [*((m.label, m.value) for m in marks(cases)), *further(cases)]:
+        for label, value in [*((m.label, m.value) for m in compute_targets(cases)), *compute_further_rates(cases)]:
             numbers: tuple[Any, ...] = (value, None, None, None, None)
             if isinstance(value, Rate):
                 numbers = (value.share, value.hits, value.of, *(value.bounds or (None, None)))
@@ -63,76 +67,80 @@ def rounds_csv(rounds: Mapping[str, Sequence[Mapping[str, Any]]]) -> str:
     return file.getvalue()
 
 
-def by_effect(cases: Sequence[Mapping[str, Any]]) -> str:
-    """Markdown with the singles of each effect."""
-    said = lambda r: f"{r.hits} of {r.of}" if r.of else NO_VALUE  # noqa: E731
-    rows = [(name, *map(said, rates)) for name, rates in hidden_rates.by_effect(cases).items()]
-    return _lines(("one effect, class identified", "half its typical size", "typical", "1.5", "of all that show"), rows)
+def tabulate_effects(cases: Sequence[Mapping[str, Any]]) -> str:
+    """Return Markdown with the rates of each single effect."""
+    count = lambda r: f"{r.hits} of {r.of}" if r.of else NO_VALUE  # noqa: E731
+    rows = [(name, *map(count, rates)) for name, rates in hidden_rates.by_effect(cases).items()]
+    return _markdown_table(
+        ("one effect, class identified", "half its typical size", "typical", "1.5", "of all that show"), rows
+    )
 
 
-def _figures(cases: Sequence[Mapping[str, Any]]) -> dict[str, tuple[str, str]]:
-    """(figure, bounds) by its label."""
-    values = [*((m.label, m.value) for m in marks(cases)), *further(cases)]
-    return {label: _figure(label, value) for label, value in values}
+def _format_figures(cases: Sequence[Mapping[str, Any]]) -> dict[str, tuple[str, str]]:
+    """Return (figure, bounds) by label."""
+    values = [*((m.label, m.value) for m in compute_targets(cases)), *compute_further_rates(cases)]
+    return {label: _format_figure(label, value) for label, value in values}
 
 
-def _figure(label: str, value: Rate | float | None) -> tuple[str, str]:
-    point, bounds, count = _value(value, label.startswith("mean size") or label.endswith("a case"))
+def _format_figure(label: str, value: Rate | float | None) -> tuple[str, str]:
+    point, bounds, count = _format_value(value, label.startswith("mean size") or label.endswith("a case"))
     return (f"{value.hits} of {count}" if isinstance(value, Rate) and value.of else point), bounds
 
 
-def seconds(cases: Sequence[Mapping[str, Any]]) -> str:
-    """What a case costs."""
+def describe_durations(cases: Sequence[Mapping[str, Any]]) -> str:
+    """Return a line about the duration of the diagnoses."""
     spent = [c["seconds"] for c in cases if c["seconds"] is not None]
     if not cases:
         return "no case is finished"
     count = f"{len(cases)} cases, {sum(c['sealed'] for c in cases)} of them sealed"
     if not spent:
-        return f"every diagnosis was stopped on its way, so that what it took is not known, {count}"
+        return f"every diagnosis was stopped and resumed, so its duration is not known, {count}"
+    fast = sum(t <= MAX_DIAGNOSIS_S for t in spent)
     return (
-        f"{np.median(spent):.0f} s a diagnosis (median; longest {max(spent):.0f} s; {sum(t <= LONG for t in spent)} of "
-        f"{len(spent)} within {LONG / 60:.0f} minutes; cases that run beside it slow it down), {count}"
+        f"{np.median(spent):.0f} s a diagnosis (median; longest {max(spent):.0f} s; {fast} of {len(spent)} within "
+        f"{MAX_DIAGNOSIS_S / 60:.0f} minutes; cases that run at the same time slow it down), "
+        f"{count}"
     )
 
 
-def _mark(m: Mark) -> tuple[str, ...]:
-    sign, count = "≥" if m.least else "≤", m.label.startswith("mean size")
-    must, aim = (f"{sign} {x:g}" if count else f"{sign} {percent(x)}" for x in (m.must, m.aim))
-    return (m.label, must, aim, *_value(m.value, count), m.reached)
+def _target_row(m: Target) -> tuple[str, ...]:
+    sign, count = "≥" if m.is_minimum else "≤", m.label.startswith("mean size")
+    must, aim = (f"{sign} {x:g}" if count else f"{sign} {format_percent(x)}" for x in (m.must, m.aim))
+    return (m.label, must, aim, *_format_value(m.value, count), m.reached)
 
 
-def _rate(label: str, value: Rate | float | None) -> tuple[str, ...]:
-    return (label, *_value(value, label.endswith("a case")))
+def _rate_row(label: str, value: Rate | float | None) -> tuple[str, ...]:
+    return (label, *_format_value(value, label.endswith("a case")))
 
 
-def _value(value: Rate | float | None, count: bool = False) -> tuple[str, str, str]:
-    """(point, bounds, number of cases)."""
+def _format_value(value: Rate | float | None, count: bool = False) -> tuple[str, str, str]:
+    """Return (point estimate, bounds, number of cases)."""
     if isinstance(value, Rate):
-        bounds = NO_VALUE if value.bounds is None else "{}–{}".format(*map(percent, value.bounds))
-        return percent(value.share), bounds, str(value.of)
-    return (NO_VALUE if value is None else f"{value:.2f}" if count else percent(value)), "", ""
+        bounds = NO_VALUE if value.bounds is None else "{}–{}".format(*map(format_percent, value.bounds))
+        return format_percent(value.share), bounds, str(value.of)
+    return (NO_VALUE if value is None else f"{value:.2f}" if count else format_percent(value)), "", ""
 
 
-def percent(share: float | None) -> str:
-    """Whole per cents."""
+def format_percent(share: float | None) -> str:
+    """Return whole per cent."""
     return NO_VALUE if share is None else f"{100 * share:.0f} %"
 
 
-CASE = ("case", "family", "kind", "hidden", "verdict", "named", "", "amplitude", "gain", "s")
+CASE_COLUMNS = ("case", "family", "kind", "hidden", "verdict", "named", "", "amplitude", "gain", "s")
 
 
-def _case(c: Mapping[str, Any]) -> tuple[str, ...]:
+def _case_row(c: Mapping[str, Any]) -> tuple[str, ...]:
     off = [f"{100 * a['error']:+.0f} %" for a in c.get("amplitudes", ()) if a is not None]
     gain = "" if c.get("gain") is None else f"{c['gain']:.2f}"
     named = ", ".join(c["named"]) or NO_VALUE
-    said = "right" if c["right"] else "alarm" if c["family"] in NULLS and c["named"] else "missed"
-    said += ", false cause" if c["wrong"] and said != "alarm" else ""
+    outcome = "right" if c["right"] else "alarm" if c["family"] in NULL_FAMILIES and c["named"] else "missed"
+    outcome += ", false cause" if c["wrong"] and outcome != "alarm" else ""
     hidden = ", ".join(c["hidden"]) or NO_VALUE
-    first = (c["name"], c["family"], c["kind"], hidden, c["verdict"], named, said)
+    first = (c["name"], c["family"], c["kind"], hidden, c["verdict"], named, outcome)
     return (*first, ", ".join(off), gain, NO_VALUE if c["seconds"] is None else f"{c['seconds']:.0f}")
 
 
-def _filled(title: str, headings: Sequence[str], rows: Sequence[Sequence[str]], left: int = 1):
+def _fill_table(title: str, headings: Sequence[str], rows: Sequence[Sequence[str]], left: int = 1):
     out = make_table(title, *headings, left=left)
     for column in out.columns:
         column.no_wrap = False
@@ -141,6 +149,6 @@ def _filled(title: str, headings: Sequence[str], rows: Sequence[Sequence[str]], 
     return out
 
 
-def _lines(headings: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+def _markdown_table(headings: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     table = [headings, ["---"] * len(headings), *([cell.replace("|", "or") for cell in row] for row in rows)]
     return "\n".join("| " + " | ".join(row) + " |" for row in table)

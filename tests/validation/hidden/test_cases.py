@@ -198,7 +198,7 @@ def test_motions_that_some_effects_need_are_made_for_others_as_well():
 
 
 def test_tables_know_every_kind_of_confounded_case():
-    assert hidden_rates.CONFOUNDED == case_sampling.CONFOUNDED_KINDS
+    assert hidden_rates.CONFOUNDED_KINDS == case_sampling.CONFOUNDED_KINDS
 
 
 def test_two_base_offsets_add_up_as_vectors():

@@ -11,7 +11,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from ...validation.realdata import swings
+from torchcloth._utils.constants import STANDARD_AIR_DENSITY_KG_PER_M3
+
 from .swing_predictions import bootstrap_indices, frequency_and_decay, predict
 from .swings import FITTED_NAMES, NOMINAL_DENSITY_KG_PER_M2, RATIO_UNITS
 
@@ -26,7 +27,7 @@ def match(source: Path, names: Sequence[str], fast: bool) -> dict[str, Any]:
     delta f / (1 + mu) with the drag delta. Both hold in the limit of small swings, so the steps are repeated. Standard
     errors are from a bootstrap over the runs.
     """
-    air, values = swings.AIR_DENSITY_KG_PER_M3, dict(START_VALUES)
+    air, values = STANDARD_AIR_DENSITY_KG_PER_M3, dict(START_VALUES)
     for remaining in reversed(range(1 if fast else PROPORTION_ROUNDS)):
         runs = [predict(source, name, {"model": values}) for name in names]
         measured = frequency_and_decay([run["measured"] for run in runs], bootstrap_indices(len(runs), BOOTSTRAP_DRAWS))

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from torchcloth import effects, materials, meshes, recordings
+from torchcloth._utils.constants import STANDARD_AIR_DENSITY_KG_PER_M3
 from torchcloth.cloth import Cloth
 from torchcloth.identification import Identification, build_cloth, identify
 
@@ -74,8 +75,8 @@ def cloth_of(run: recordings.Recording, values: dict[str, float]) -> Cloth:
     """Build the hanging cloth in air with these values."""
     parts = {
         "gravity": effects.Gravity(),
-        "air": effects.AirDrag(values["air.normal"], swings.AIR_DENSITY_KG_PER_M3),
-        "added": effects.AddedMass(values["added.length"], swings.AIR_DENSITY_KG_PER_M3),
+        "air": effects.AirDrag(values["air.normal"], STANDARD_AIR_DENSITY_KG_PER_M3),
+        "added": effects.AddedMass(values["added.length"], STANDARD_AIR_DENSITY_KG_PER_M3),
         "damping": effects.MassDamping(values["damping.rate"]),
         "bending": effects.Bending(swings.IRI_BENDING_N_M, swings.IRI_DAMPING_TIME_S),
     }
@@ -97,7 +98,7 @@ def fit(source: Path, names: Sequence[str], journal: Path, fast: bool) -> Identi
 
 def ratios(fit: dict[str, Any]) -> dict[str, dict[str, float | bool]]:
     """Return the identifiable quantities: ratios to the areal density, and the damping rate."""
-    air, out = swings.AIR_DENSITY_KG_PER_M3, {}
+    air, out = STANDARD_AIR_DENSITY_KG_PER_M3, {}
     for effect, key, factor in zip(
         RATIO_UNITS, FITTED_NAMES, (air / NOMINAL_DENSITY_KG_PER_M2, air / NOMINAL_DENSITY_KG_PER_M2, 1.0), strict=True
     ):
