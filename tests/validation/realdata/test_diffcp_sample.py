@@ -1,4 +1,4 @@
-"""The released DiffCP sample through the adapter and the real command line. Nothing of it is kept in the project."""
+"""The released DiffCP sample through the adapter and the real command line. It is not part of the project."""
 
 from __future__ import annotations
 
@@ -23,11 +23,11 @@ ONE_THREAD = {**os.environ, "OMP_NUM_THREADS": "1"}
 
 
 def run(*arguments: str | Path, seconds: float) -> str:
-    """Standard output of a subprocess that must succeed."""
+    """Return the standard output of a subprocess that must succeed."""
     command = [sys.executable, *map(str, arguments)]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=seconds, env=ONE_THREAD)
-    assert done.returncode == 0, f"exit code {done.returncode}\n{done.stdout}\n{done.stderr}"
-    return done.stdout
+    process = subprocess.run(command, capture_output=True, text=True, timeout=seconds, env=ONE_THREAD)
+    assert process.returncode == 0, f"exit code {process.returncode}\n{process.stdout}\n{process.stderr}"
+    return process.stdout
 
 
 @pytest.fixture(scope="module")
@@ -47,15 +47,15 @@ def recording(episode: Path) -> Recording:
     return recordings.read(episode)
 
 
-def one_sided(cloud: np.ndarray, vertices: np.ndarray) -> float:
-    """Mean distance from each point to its nearest vertex [m]."""
+def one_sided_distance(cloud: np.ndarray, vertices: np.ndarray) -> float:
+    """Return the mean distance [m] from each point to its nearest vertex."""
     return float(np.linalg.norm(cloud[:, None] - vertices[None], axis=-1).min(1).mean())
 
 
 def test_null_of_the_readme(recording):
     """Initial mesh, no simulation: 0.023 to 0.096 m, mean 0.060 m (README of the sample). Right axes, right scale."""
     assert recording.points is not None
-    null = [one_sided(recording.points.frame(i), recording.cloth.vertices) for i in range(8)]
+    null = [one_sided_distance(recording.points.frame(i), recording.cloth.vertices) for i in range(8)]
     # 2 mm: the adapter lifts vertices onto the table and drops a pocket of four triangles
     assert min(null) == pytest.approx(0.023, abs=0.002)
     assert max(null) == pytest.approx(0.096, abs=0.002)
@@ -89,14 +89,16 @@ def test_pattern_is_nearly_isometric(recording):
     assert recording.extra["notes"]["mesh"]["area_of_pattern_m2"] == pytest.approx(0.748, rel=0.01)
 
 
-def test_grippers_hold_the_vertices_beside_them(recording):
+def test_grippers_hold_the_nearest_vertices(recording):
     cloth = build_cloth(recording)
     for name, motion in recording.grippers.items():
-        held = cloth.boundaries[name]
-        assert isinstance(held, Grasp)
-        assert held.index.tolist() == [recording.extra["notes"]["held vertices"][name]], "a ball joint is one vertex"
-        place = recording.cloth.initial_vertices[held.index[0]]
-        assert np.linalg.norm(place - motion.position[0]) < 0.025
+        grasp = cloth.boundaries[name]
+        assert isinstance(grasp, Grasp)
+        assert grasp.index.tolist() == [recording.extra["notes"]["grasped vertices"][name]], (
+            "a ball joint is one vertex"
+        )
+        position = recording.cloth.initial_vertices[grasp.index[0]]
+        assert np.linalg.norm(position - motion.position[0]) < 0.025
 
 
 def test_grippers_follow_the_recorded_path(recording, source):
@@ -116,7 +118,7 @@ def check_result(folder: Path, printed: str) -> dict[str, float]:
     for key in ("null", "before", "after"):
         assert f"{fit[f'chamfer_{key}']:.6f}" in printed
     assert "null" in printed
-    # Not compared with the start's: slack layers move chaotically, and E h from 10 to 1500 N/m changes 23 mm by 1.5 mm.
+    # No comparison with the start: slack layers are chaotic, and E h from 10 to 1500 N/m changes 23 mm by 1.5 mm.
     assert fit["chamfer_after"] < 0.5 * fit["chamfer_null"]
     return fit
 
@@ -132,9 +134,9 @@ def test_identify_a_part(source, tmp_path):
 
 @pytest.mark.slow
 def test_identify_all(episode, recording, tmp_path):
-    """All clouds; also better than leaving the dress where it was, which is the stronger null here."""
+    """All clouds; also better than a dress that does not move, which is the stronger null model here."""
     options = ("--fit", "youngs_modulus", "--iterations", "3")
     printed = run("-m", "torchcloth.cli", "identify", episode, "--out", tmp_path / "out", *options, seconds=1200)
     fit = check_result(tmp_path / "out", printed)
-    null = [one_sided(recording.points.frame(i), recording.cloth.vertices) for i in range(8)]
+    null = [one_sided_distance(recording.points.frame(i), recording.cloth.vertices) for i in range(8)]
     assert fit["chamfer_after"] < 0.5 * np.mean(null)

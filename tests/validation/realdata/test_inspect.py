@@ -1,4 +1,4 @@
-"""``inspect`` on measured episodes, whose faults were found by others before.
+"""``inspect`` on measured episodes with known faults.
 
 The IRI swings' own README: stamps lag the tool by about 0.32 s, static noise 1 to 4 mm, frames to be rejected by arc
 length. The lifted clouds were cropped by their authors at z = 0.075 m.
@@ -14,22 +14,30 @@ import pytest
 
 from torchcloth import recordings as rec
 from torchcloth.inspection import inspect
-from torchcloth.training.validation.realdata import lifts as lifts_of
-from torchcloth.training.validation.realdata import swings as swings_of
+from torchcloth.training.validation.realdata import lifts as lift_adapter
+from torchcloth.training.validation.realdata import swings as swing_adapter
 
 pytestmark = pytest.mark.realdata
-RUNS = ("range30_rep3", "range30_rep9", "range60_rep3", "range60_rep5", "range60_rep8", "range90_rep1", "range90_rep6")
-README_LAG = 0.32  # s
+INSPECTED_RUNS = (
+    "range30_rep3",
+    "range30_rep9",
+    "range60_rep3",
+    "range60_rep5",
+    "range60_rep8",
+    "range90_rep1",
+    "range90_rep6",
+)
+README_LAG_S = 0.32
 
 
-def swing(source: Path, run: str) -> rec.Recording:
-    """One run's grid of nodes with its raw stamps, as if nobody had looked at them."""
-    return replace(swings_of.episode(source, run), points=None, clock_offset=0.0)
+def read_raw_swing(source: Path, run: str) -> rec.Recording:
+    """Return one run's grid of nodes with its raw stamps."""
+    return replace(swing_adapter.read_episode(source, run), points=None, clock_offset=0.0)
 
 
-def lift(source: Path, trial: str) -> rec.Recording:
-    """One lift with all its points."""
-    return lifts_of.episode(source, trial, crop=False)
+def read_raw_lift(source: Path, trial: str) -> rec.Recording:
+    """Return one lift with all its points."""
+    return lift_adapter.read_episode(source, trial, crop=False)
 
 
 @pytest.fixture
@@ -43,42 +51,42 @@ def lifts(measured_in) -> Path:
 
 
 def test_the_swings_lag_by_0_32_s(swings):
-    found = [inspect(swing(swings, run)) for run in RUNS]
-    lags = np.array([f.lag.value for f in found])
-    assert all(f.lag.told and f.lag.std < 0.02 for f in found)
-    assert np.median(lags) == pytest.approx(README_LAG, abs=0.02)
-    assert np.abs(lags - README_LAG).max() < 0.03
-    assert all("clocks differ" in " ".join(f.notes) for f in found)
-    rejected = np.array([f.frames["markers"].rejected.mean() for f in found])
+    reports = [inspect(read_raw_swing(swings, run)) for run in INSPECTED_RUNS]
+    lags = np.array([f.lag.value for f in reports])
+    assert all(f.lag.is_determined and f.lag.std < 0.02 for f in reports)
+    assert np.median(lags) == pytest.approx(README_LAG_S, abs=0.02)
+    assert np.abs(lags - README_LAG_S).max() < 0.03
+    assert all("clocks differ" in " ".join(f.notes) for f in reports)
+    rejected = np.array([f.frames["markers"].rejected.mean() for f in reports])
     assert 0.03 < np.median(rejected) < 0.17
-    noise = np.array([f.noise["markers"].std for f in found])
+    noise = np.array([f.noise["markers"].std for f in reports])
     assert 0.0005 < noise.min() < noise.max() < 0.006
     assert 0.001 < np.median(noise) < 0.004
-    rates = np.array([f.streams["markers"].rate for f in found])
+    rates = np.array([f.streams["markers"].rate for f in reports])
     assert np.median(rates) == pytest.approx(9, abs=1)
-    assert all(f.streams["markers"].gaps > 0 for f in found)
+    assert all(f.streams["markers"].gaps > 0 for f in reports)
 
 
 @pytest.mark.slow
 def test_all_swings(swings):
     """Median lag 0.330 s (0.312 to 0.359), noise 1.9 mm (0.4 to 7.5), 14 % of the frames rejected (6 to 32)."""
     names = [f"range{size}_rep{k}" for size in (30, 60, 90) for k in range(1, 11)]
-    found = [inspect(swing(swings, name)) for name in names]
-    lags = np.array([f.lag.value for f in found])
-    assert np.median(lags) == pytest.approx(README_LAG, abs=0.015)
-    assert (np.abs(lags - README_LAG) < 0.03).mean() > 0.9
-    assert np.median([f.frames["markers"].rejected.mean() for f in found]) == pytest.approx(0.14, abs=0.02)
-    assert np.median([f.noise["markers"].std for f in found]) == pytest.approx(0.0019, abs=0.0005)
+    reports = [inspect(read_raw_swing(swings, name)) for name in names]
+    lags = np.array([f.lag.value for f in reports])
+    assert np.median(lags) == pytest.approx(README_LAG_S, abs=0.015)
+    assert (np.abs(lags - README_LAG_S) < 0.03).mean() > 0.9
+    assert np.median([f.frames["markers"].rejected.mean() for f in reports]) == pytest.approx(0.14, abs=0.02)
+    assert np.median([f.noise["markers"].std for f in reports]) == pytest.approx(0.0019, abs=0.0005)
 
 
 @pytest.mark.parametrize("trial", ["lift_paper", "lift_tan"])
 def test_the_lifts_crop_and_outliers(lifts, trial):
-    report = inspect(lift(lifts, trial))
-    found = report.frames["points"]
-    assert found.cuts["z >"] == pytest.approx(0.075, abs=2e-4)
-    assert 0.002 < found.removed["outliers"] / len(report.recording.points.xyz) < 0.02
-    assert 0.002 < found.removed["clusters"] / len(report.recording.points.xyz) < 0.1
-    # 25 frames of which the first show no cloth yet: nothing told, or nothing that its error does not cover
-    assert not report.lag.told or abs(report.lag.value) < 2 * report.lag.std
+    report = inspect(read_raw_lift(lifts, trial))
+    frames = report.frames["points"]
+    assert frames.crop_planes["z >"] == pytest.approx(0.075, abs=2e-4)
+    assert 0.002 < frames.removed["outliers"] / len(report.recording.points.xyz) < 0.02
+    assert 0.002 < frames.removed["clusters"] / len(report.recording.points.xyz) < 0.1
+    # 25 frames, of which the first show no cloth: the lag is undetermined, or its error covers zero
+    assert not report.lag.is_determined or abs(report.lag.value) < 2 * report.lag.std
     assert report.noise["points"].std < 0.001
     assert report.streams["points"].rate == pytest.approx(10)

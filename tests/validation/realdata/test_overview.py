@@ -1,4 +1,4 @@
-"""The overview: two quick adapters by themselves, and all of them through the command."""
+"""The overview: two quick adapters alone, and all of them through the command."""
 
 from __future__ import annotations
 
@@ -17,22 +17,22 @@ pytestmark = pytest.mark.realdata
 
 def test_rows(measured_in, tmp_path):
     out = tmp_path / "bias_extension"
-    row = overview.of_bias_extension(measured_in("bias_extension"), out)
+    row = overview.summarise_bias_extension(measured_in("bias_extension"), out)
     assert row.size == "43 rows"
-    assert "24.7 N/m" in row.found
+    assert "24.7 N/m" in row.estimate
     assert (tmp_path / "bias_extension.png").stat().st_size > 10_000
     assert len(recordings.read_tension(out / "glass_plain")) == 43
-    row = overview.of_cantilever(measured_in("cantilever"), tmp_path / "cantilever")
-    assert row.found == "tip (0.222, -0.113) m"
+    row = overview.summarise_cantilever(measured_in("cantilever"), tmp_path / "cantilever")
+    assert row.estimate == "tip (0.222, -0.113) m"
 
 
 @pytest.mark.slow
 def test_all(realdata, tmp_path):
     command = [sys.executable, "-m", overview.__name__, "--out", tmp_path, "--source", realdata]
-    done = subprocess.run(list(map(str, command)), capture_output=True, text=True, timeout=600)
-    assert done.returncode == 0, done.stderr
+    process = subprocess.run(list(map(str, command)), capture_output=True, text=True, timeout=600)
+    assert process.returncode == 0, process.stderr
     rows = json.loads((tmp_path / "overview.json").read_text())
-    assert [row["source"] for row in rows] == [line for line in (r["source"] for r in rows) if line in done.stdout]
+    assert [row["source"] for row in rows] == [line for line in (r["source"] for r in rows) if line in process.stdout]
     assert len(rows) == len(overview.ADAPTERS)
     assert len(list(tmp_path.glob("*.png"))) == 6
     assert len(list(Path(tmp_path).glob("iri_cloth_swings/*/episode.json"))) == 30

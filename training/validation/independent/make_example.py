@@ -3,8 +3,8 @@
     python -m torchcloth.training.validation.independent.make_example [--out DIR] [--seed 0]
 
 The truth comes from another engine (see mujoco_cloth.py) on a mesh and a time step of its own. The same seed and
-the same versions of mujoco, numpy, scipy, open3d and torch on the same kind of machine give the same numbers bit by bit; other
-versions may round differently.
+the same versions of mujoco, numpy, scipy, open3d and torch on the same kind of machine give the same numbers bit by
+bit. Other versions may round differently.
 
 The fabric is an acrylic rib knit, course direction: Y = 50 N/m, secant at 10 % strain (Singal et al. 2024, Nat.
 Commun. 15:2622). Here it is the small-strain stiffness of a Saint Venant-Kirchhoff membrane, which stiffens: its
