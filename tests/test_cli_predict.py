@@ -40,7 +40,7 @@ def test_a_strip_at_any_angle(strips, tmp_path, capsys):
     out = tmp_path / "out"
     assert main(["predict", str(strips), "--angle", "30", "--out", str(out)]) == 0
     printed = capsys.readouterr().out
-    for word in ("Strip at 30 degrees", "by parameters", "by the law", "95 % interval", "note: the law's part"):
+    for word in ("Strip at 30 degrees", "by parameters", "by the misfit", "95 % interval", "note: the law's part"):
         assert word in printed
     content = json.loads((out / "prediction.json").read_text())
     low, high = np.array(content["force"]["ci95"])

@@ -14,7 +14,7 @@ WRITTEN = {
     "pose.json": "pose/result.py",
     "plan.json": "planning/result.py",
     "confirmation.json": "diagnosis/confirmation.py",
-    "inspection.json": "inspection/look.py",
+    "inspection.json": "inspection/inspect_recording.py",
 }
 
 

@@ -34,9 +34,9 @@ def result(pair, other, tmp_path_factory):
 
 def test_what_was_not_fitted_is_as_near_as_what_was(result, pair):
     """Noise of 1 mm; the null is far off."""
-    assert result.figures["rms"] < 1.2 * pair.fit["rms_after"]
-    assert result.figures["rms"] < 0.3 * result.figures["rms_null"]
-    assert result.law == pair.fit["rms_after"]
+    assert result.metrics["rms"] < 1.2 * pair.fit["rms_after"]
+    assert result.metrics["rms"] < 0.3 * result.metrics["rms_null"]
+    assert result.misfit_std == pair.fit["rms_after"]
 
 
 def test_the_error_is_that_of_finite_steps(result, pair, other):
@@ -52,17 +52,17 @@ def test_the_error_is_that_of_finite_steps(result, pair, other):
         moved = torch.stack([simulate(cloth, unknowns, raw + step, data).x - centre for step in steps]) / 0.1
     matrix = torch.tensor([[pair.correlation[a.name][b.name] for b in unknowns] for a in unknowns])
     expected = torch.einsum("ktvc,kl,ltvc->tv", moved, matrix, moved).sqrt()
-    assert result.std.shape == expected.shape
-    assert float((result.std - expected).abs().max()) < 0.02 * float(expected.max())
-    assert float(result.std[0].max()) < float(result.std.max())
+    assert result.vertex_std.shape == expected.shape
+    assert float((result.vertex_std - expected).abs().max()) < 0.02 * float(expected.max())
+    assert float(result.vertex_std[0].max()) < float(result.vertex_std.max())
 
 
 def test_the_interval_holds_what_is_measured(result, pair):
     """Of the whole: parameters and what the fit left; of 960 points with 1 mm of noise, one in twenty is outside."""
-    assert 0.92 < result.inside < 0.98
-    assert result.interval.shape == (8, len(result.cloth.mesh.faces))
-    assert float(result.interval.min()) >= 1.959 * pair.fit["rms_after"]
-    assert float(result.interval.max()) <= 1.97 * (pair.fit["rms_after"] + float(result.std.max()))
+    assert 0.92 < result.coverage < 0.98
+    assert result.half_width.shape == (8, len(result.cloth.mesh.faces))
+    assert float(result.half_width.min()) >= 1.959 * pair.fit["rms_after"]
+    assert float(result.half_width.max()) <= 1.97 * (pair.fit["rms_after"] + float(result.vertex_std.max()))
 
 
 def test_only_forces_are_compared_where_there_is_nothing_else(pair, other, tmp_path, capsys):
@@ -97,7 +97,7 @@ def test_what_nobody_has_seen_yet_is_predicted_along_its_motion(pair, other, tmp
     assert result.as_dict()["std_parameters"]["rms"] > 0
     assert set(result.as_dict()["measured"].values()) == {None}
     print_episode_prediction(result)
-    assert "nothing was seen or felt in this episode to compare with" in capsys.readouterr().out
+    assert "the episode has no data to compare with" in capsys.readouterr().out
 
 
 def test_another_model_is_refused(pair, other, tmp_path):
@@ -113,7 +113,7 @@ def test_another_model_is_refused(pair, other, tmp_path):
         predict_episode(path, other)
 
 
-def test_tangents_of_an_unstable_motion_are_replace_wrong_tangents():
+def test_tangents_of_an_unstable_motion_are_replaced_by_steps():
     """A sheet that buckles: by tangents a vertex was known to metres, where a standard error moves it by 2 cm."""
     mesh = tc.meshes.rectangle(0.4, 0.4, resolution=(8, 8))
     t, (u, v) = np.linspace(0.0, 0.6, 61), mesh.uv.T
@@ -137,7 +137,7 @@ def test_tangents_of_an_unstable_motion_are_replace_wrong_tangents():
         data, unknowns = build_episode(cloth, swing), collect_unknowns(cloth, ["youngs_modulus", "air.normal"], None)
         raw, covariance = torch.tensor([u.start for u in unknowns]), torch.diag(torch.tensor([0.02, 0.03]) ** 2)
         both = simulate_with_tangents(cloth, unknowns, raw, data)
-        moved, missing, untried = _replace_wrong_tangents(cloth, unknowns, raw, data, None, both, covariance)
+        moved, missing, untried = _replace_wrong_tangents(cloth, unknowns, raw, data, None, *both, covariance)
         before, after = (
             propagate_errors(cloth, data, both[0], m, covariance, 1e-3).vertex_std for m in (both[1], moved)
         )

@@ -120,7 +120,7 @@ def test_a_fit_is_held_against_the_null_of_the_data_that_tell(felt):
 
 @pytest.mark.parametrize("options", [{"method": "adam"}, {"stop": "paper"}])
 def test_what_follows_the_chamfer_distance_needs_something_seen(felt, options):
-    with pytest.raises(InvalidInput, match="neither points nor markers; expected something seen"):
+    with pytest.raises(InvalidInput, match="neither points nor markers; expected points or markers"):
         identify(build_cloth(felt), felt, STIFFNESS, **options)
 
 

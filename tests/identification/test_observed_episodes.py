@@ -355,7 +355,7 @@ def test_force_readings_after_the_last_cloud_are_told():
     short = replace(twins.first(whole, 4), grippers=hands)
     data = build_episode(twins.at(short), short)
     assert data.readings_after_last_frame > 10
-    assert any("force readings come after the last frame that was seen" in doubt for doubt in data.data_warnings())
+    assert any("force readings come after the last frame with points" in doubt for doubt in data.data_warnings())
     assert build_episode(twins.at(whole), replace(whole, grippers=hands)).readings_after_last_frame == 0
 
 

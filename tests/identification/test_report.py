@@ -132,7 +132,7 @@ def test_an_unstable_motion_is_said_and_differences_replace_tangents():
         assert bool(checked.warnings) == checked.is_withdrawn == warned
         assert checked.curved_parameters == bent
         assert (checked.final.linear is not at_start.linear) == warned
-    assert "tangents of youngs_modulus miss finite steps by up to 80 %" in checked.warnings[0]
+    assert "tangents of youngs_modulus differ from finite steps by up to 80 %" in checked.warnings[0]
     away = at_start._replace(linear=linear(1e4))
     assert linearity.has_runaway_tangents(fake, away)
     assert not linearity.has_runaway_tangents(fake, at_start)

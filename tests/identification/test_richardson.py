@@ -72,8 +72,8 @@ def test_a_residual_force_is_no_parameter_and_no_obstacle(model):
     cloth = tc.Cloth(model.mesh, tc.materials.AEP(1e5), 0.2, {"residual": law}, contact=None)
     assert "residual.strength" not in fit.default_parameters(cloth)
     fine = refine_cloth(cloth)
-    assert fine.effects["residual"].held == (0, 1)
-    assert len(fine.effects["residual"].share) == len(fine.mesh.vertices)
+    assert fine.effects["residual"].gripped_vertices == (0, 1)
+    assert len(fine.effects["residual"].weights) == len(fine.mesh.vertices)
 
 
 def test_fields_are_refused_before_anything_is_computed(model, recording):

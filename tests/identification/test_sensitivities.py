@@ -82,7 +82,7 @@ def test_tangents_do_not_keep_the_substeps(short, monkeypatch):
         return state, impulses
 
     monkeypatch.setattr(substep, "step", watched)
-    simulate_with_tangents(model, unknowns[:2], start(unknowns[:2]), seen.until(0.0))
+    simulate_with_tangents(model, unknowns[:2], start(unknowns[:2]), seen.first_fraction(0.0))
     assert len(alive) > 100
     assert most <= 4  # the present one, its predecessor, the last frame's
 
