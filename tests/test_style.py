@@ -22,26 +22,27 @@ FORBIDDEN_IDENTIFIERS = frozenset(("lost", "told", "found", "kept", "held", "own
 
 # First words of public docstrings. A verb that is missing is welcome here.
 _VERBS = """
-Accept Add Advance Align Allocate Annotate Append Apply Arrange Ask Assemble Assign Attach Average Begin Bind
-Bound Bring Broadcast Build Calibrate Call Cancel Capture Carry Cast Change Check Choose Clamp Clear Clip
-Clone Close Collect Combine Compare Compile Complete Compose Compute Concatenate Configure Connect Construct
-Continue Convert Copy Correct Count Create Crop Cut Decide Declare Decode Delete Demand Derive Describe Detect
-Determine Differentiate Disable Discard Display Distribute Divide Download Draw Drive Drop Dump Emit Enable
-Encode End Ensure Enumerate Estimate Evaluate Exclude Execute Expand Explain Export Expose Extend Extract
-Extrapolate Fetch Fill Filter Find Finish Fit Flag Flatten Flush Fold Follow Format Forward Freeze Gather
-Generate Get Give Group Handle Hide Identify Ignore Import Include Increase Inflate Initialise Insert Inspect
-Install Integrate Interpolate Invert Iterate Join Keep Label Launch Lay Leave Let Lift Limit Linearise Link
-List Load Locate Log Lower Make Map Mark Mask Match Maximise Measure Merge Minimise Mirror Move Multiply Name
-Normalise Observe Omit Open Optimise Overlay Pad Parse Partition Perform Perturb Pick Place Plan Play Plot
-Predict Prepare Print Process Produce Project Propagate Propose Prune Pull Push Put Quantify Raise Read
-Rebuild Recompute Record Reduce Refine Refit Refuse Register Reject Relax Release Reload Remove Rename Render
-Renumber Reorder Repeat Replace Replay Report Require Resample Reserve Reset Reshape Resolve Restart Restore
-Restrict Resume Retrieve Return Reverse Reweight Rotate Round Run Sample Save Say Scale Scan Scatter Schedule
-Score Search See Segment Select Send Serialise Set Settle Shade Shift Show Shrink Shuffle Simplify Simulate
-Skip Slice Smooth Solve Sort Specify Spill Split Stack Standardise Start Step Stop Store Stream Stretch
-Subdivide Submit Subtract Suggest Sum Summarise Suppress Swap Swing Switch Take Terminate Test Time Trace
-Track Train Transfer Transform Translate Transpose Triangulate Truncate Try Turn Undo Unfold Unpack Unwrap
-Update Upgrade Use Validate Vary Verify Visualise Wait Walk Warn Weigh Weld Widen Wrap Write Yield
+Accept Adapt Add Advance Align Allocate Annotate Append Apply Archive Arrange Ask Assemble Assign Attach
+Average Begin Bind Bound Bring Broadcast Build Calibrate Call Cancel Capture Carry Cast Change Check Choose
+Clamp Clear Clip Clone Close Collapse Collect Combine Compare Compile Complete Compose Compute Concatenate
+Configure Connect Construct Continue Convert Copy Correct Count Create Crop Cut Decide Declare Decode Delete
+Demand Derive Describe Detect Determine Diagnose Differentiate Disable Discard Display Distribute Divide
+Download Draw Drive Drop Dump Emit Enable Encode End Ensure Enumerate Estimate Evaluate Exchange Exclude
+Execute Expand Explain Export Expose Extend Extract Extrapolate Fetch Fill Filter Find Finish Fit Flag Flatten
+Flush Fold Follow Format Forward Freeze Gather Generate Get Give Group Handle Hide Identify Ignore Import
+Include Increase Inflate Initialise Insert Inspect Install Integrate Interpolate Invert Iterate Join Keep
+Label Launch Lay Learn Leave Let Lift Limit Linearise Link List Load Locate Log Lower Make Map Mark Mask Match
+Maximise Measure Merge Minimise Mirror Move Multiply Name Normalise Number Observe Omit Open Optimise Overlay
+Pad Parse Partition Perform Perturb Pick Place Plan Play Plot Predict Prepare Print Process Produce Project
+Propagate Propose Prune Pull Push Put Quantify Raise Read Rebuild Recompute Record Reduce Refine Refit Refuse
+Register Reject Relax Release Reload Remove Rename Render Renumber Reorder Repeat Replace Replay Report
+Require Resample Reserve Reset Reshape Resolve Restart Restore Restrict Resume Retrieve Return Reverse
+Reweight Rotate Round Run Sample Save Say Scale Scan Scatter Schedule Score Screen Search See Segment Select
+Send Serialise Set Settle Sew Shade Shake Shift Show Shrink Shuffle Simplify Simulate Skip Slice Smooth Solve
+Sort Specify Spill Split Stack Standardise Start Step Stop Store Stream Stretch Subdivide Submit Subtract
+Suggest Sum Summarise Suppress Swap Swing Switch Take Tell Terminate Test Time Trace Track Train Transfer
+Transform Translate Transpose Triangulate Truncate Try Turn Undo Unfold Unpack Unwrap Update Upgrade Use
+Validate Vary Verify Visualise Wait Walk Warn Weigh Weld Whiten Widen Wrap Write Yield
 """
 IMPERATIVES = frozenset(_VERBS.split())
 AFTER_NOUNS = ("of", "->", "=")  # second words that make a noun of "Change" or "Name"

@@ -219,7 +219,7 @@ class Cloth(nn.Module):
         Raises:
             InvalidInput: motion that does not fit the boundaries or the times.
             UnstableStep: ``dt`` beyond the stability limit, or a limit so low that the simulation would never end.
-            SimulationDiverged: the state lost finiteness.
+            SimulationDiverged: the state is no longer finite.
         """
         return run_schedule(self.schedule(state, motion or {}, times, dt), checkpoint)
 
