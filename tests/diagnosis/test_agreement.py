@@ -15,8 +15,8 @@ from torchcloth.diagnosis.decide.candidates import (
     _find_worsened_motions,
     _measure_prior_shift,
     _rank,
-    choose_t_threshold,
     accept,
+    choose_t_threshold,
 )
 from torchcloth.diagnosis.decide.criteria import CRITERIA
 from torchcloth.diagnosis.decide.verdict import _amplitude_errors, _describe_parameters, _do_motions_disagree

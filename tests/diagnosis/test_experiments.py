@@ -38,7 +38,7 @@ from torchcloth.diagnosis.inference.linearise import central_differences
 from torchcloth.episodes.observed import build_episode
 from torchcloth.recordings import Collider
 
-MOTIONS = """
+PRINT_MOTIONS_SCRIPT = """
 import json, sys
 from torchcloth.training.validation.independent.flex_sheet import SheetSpec
 from torchcloth.training.validation.independent.motions import make_motion
@@ -56,7 +56,7 @@ def test_the_library_is_that_of_the_independent_engine():
     template = sheet_episodes.episode()
     own = float(np.rad2deg(measure_heading(template)))
     asked = json.dumps([[e.motion, e.heading + own, e.speed] for e in EXPERIMENTS])
-    run = [sys.executable, "-c", MOTIONS, asked]
+    run = [sys.executable, "-c", PRINT_MOTIONS_SCRIPT, asked]
     out = subprocess.run(run, capture_output=True, text=True, check=True).stdout
     for experiment, paths in zip(EXPERIMENTS, json.loads(out), strict=True):
         plan = make_episode(experiment, template)
@@ -121,11 +121,13 @@ def test_distances_are_those_of_two_columns():
         best = torch.linalg.lstsq(columns, target[:, None]).solution
         return float((target[:, None] - columns @ best).square().sum())
 
-    wide = lambda k: torch.cat([white[:, 2 + k], torch.zeros(2).double()])  # noqa: E731
-    beyond = lambda j, target: (
-        left(torch.cat([fitted, wide(j)[:, None]], 1), target)
-        - CRITERIA.candidate.simulator_tolerance * left(fitted, target)
-    )
+    def wide(k):
+        return torch.cat([white[:, 2 + k], torch.zeros(2).double()])
+
+    def beyond(j, target):
+        remaining = left(torch.cat([fitted, wide(j)[:, None]], 1), target)
+        return remaining - CRITERIA.candidate.simulator_tolerance * left(fitted, target)
+
     one, other = beyond(0, 0.7 * wide(2)), beyond(2, 0.4 * wide(0))
     assert told == pytest.approx(min(one, other), rel=1e-6)
     again = white[: len(white) // 2][:, [0, 1, 4, 2]]

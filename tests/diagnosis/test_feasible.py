@@ -79,7 +79,7 @@ def test_what_is_in_the_arms_way_is_said_and_not_proposed(shipped, monkeypatch):
     plan = SimpleNamespace(slower=1.3, limiting="joint4 of left: acceleration")
     monkeypatch.setattr(proposal, "check_feasibility", lambda *_: [hang, replace(turn, plan=plan)])
     arms = proposal.propose_experiment(found, content, setting, quiet).content["arms"]
-    assert arms == {"slower": 1.3, "limit": plan.limiting, "refused": {"hang": refused.why_not}}
+    assert arms == {"slowdown": 1.3, "limited_by": plan.limiting, "refused": {"hang": refused.why_not}}
     monkeypatch.setattr(proposal, "check_feasibility", lambda *_: [hang])
     assert proposal.propose_experiment(found, content, setting, quiet) is None
 

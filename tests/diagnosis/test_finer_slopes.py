@@ -33,7 +33,9 @@ def on_finer(made, hypothesis, key):
     finer, world = setting.fine_mesh, refine_model(model, [RECORDING])[0].build_world()
     e = finer.episodes[0]
     base, moved = world.simulate_observed(e), hypothesis.apply(world, hypothesis.typical).simulate_observed(e)
-    found = bin_residuals(base, finite_differences(base, [moved], [hypothesis.typical]), e, finer.surface, finer.rest)
+    found = bin_residuals(
+        base, finite_differences(base, [moved], [hypothesis.typical]), e, finer.surface, finer.rest_positions
+    )
     return align_rows(key, found.key, found.jacobian)[:, 0]
 
 
@@ -82,7 +84,7 @@ def test_the_point_itself_is_simulated_once(made, asked, monkeypatch, memory, ag
 def test_an_accepted_one_keeps_its_mesh(made, asked):
     """Beside a small amplitude, too: its own column is about what it was asked by, from the finer mesh."""
     model, setting = made
-    cause = replace(asked[1], step=1.0)  # slopes by the typical amplitude, both ways
+    cause = replace(asked[1], step_fraction=1.0)  # slopes by the typical amplitude, both ways
     found = linearise(model.with_hypothesis(cause), setting)
     place = len(model.point)
     column = 0.5 * sum(
@@ -105,7 +107,9 @@ def test_what_does_nothing_on_the_given_mesh_is_not_simulated_on_the_finer(made,
     e, finer = setting.episodes[0], (setting.fine_mesh.episodes[0], None)
     worlds = WorldCache(model, (), setting.fine_mesh.base)
     slack = replace(crease, apply=lambda world, amplitude: world.with_cloth())  # another cloth, which moves alike
-    none, some = (run_episode(worlds, e, None, [h], with_grasp_shifts=False, finer=finer) for h in (slack, asked[1]))
+    none, some = (
+        run_episode(worlds, e, None, [h], with_grasp_shifts=False, fine_episode=finer) for h in (slack, asked[1])
+    )
     assert (none.fine, none.fine_hypotheses) == (None, set())
     assert some.fine is not None
     assert some.fine_hypotheses == {0}

@@ -206,8 +206,8 @@ def test_an_arm_that_was_recorded_with_its_fingers_width_holds_while_they_are_ne
     joints = {"left": replace(whole.joints["left"], closed=None, width=width), "right": whole.joints["right"]}
     seen = CheckedEpisode(replace(whole, joints=joints))
     free = seen.t < whole.joints["left"].t[5]
-    assert np.isnan(seen.holding[free, list(seen.paths).index("left")]).all()
-    assert np.isfinite(seen.holding[~free]).all()
+    assert np.isnan(seen.holding_positions[free, list(seen.paths).index("left")]).all()
+    assert np.isfinite(seen.holding_positions[~free]).all()
 
 
 def test_episodes_of_two_cloths_are_refused(turned):
@@ -316,7 +316,7 @@ def test_an_episode_that_says_nothing_is_refused_by_name(tmp_path, capsys):
     episodes = [good[0], replace(good[1], points=short, grippers=cut, split={"motion": "fast"})]
     folders = [str(rec.write(r, tmp_path / r.split["motion"])) for r in episodes]
     assert main(["diagnose", *folders, "--out", str(tmp_path / "out")]) == 2
-    assert "fast, in which nothing is seen or felt" in " ".join(capsys.readouterr().err.split())
+    assert "fast, without points, markers or forces" in " ".join(capsys.readouterr().err.split())
     assert not (tmp_path / "out" / "progress").exists()
 
 

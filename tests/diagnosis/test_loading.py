@@ -73,7 +73,7 @@ def test_a_fit_that_began_with_a_model_brings_it_along(made, tmp_path):
     assert cloth.material.youngs_modulus.value.item() == begun.parameters["youngs_modulus"].value
     assert predict_episode(path, seen, dx.make_start_builder(path)).metrics["chamfer"] < 0.01
     assert "mm from the points" in film_from_fit(seen, tmp_path / "fit").title
-    with pytest.raises(InvalidInput, match=r"a fit of another model.*give build_start=diagnosis.start_of"):
+    with pytest.raises(InvalidInput, match=r"a fit of another model.*give build_start=diagnosis.make_start_builder"):
         load_fitted_cloth(path, seen)
     plain = identify(build_cloth(seen), seen, ["youngs_modulus"], iterations=1)
     assert dx.make_start_builder(plain.save(tmp_path / "fit")) is None

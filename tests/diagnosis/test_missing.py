@@ -4,7 +4,7 @@ import pytest
 import torch
 from helpers import sheet_episodes
 
-from torchcloth.diagnosis import build_base_model, fit, measure_lack_of_fit, missing_force, prepare_data
+from torchcloth.diagnosis import build_base_model, estimate_missing_force, fit, measure_lack_of_fit, prepare_data
 from torchcloth.diagnosis.unknown import missing_force as missing
 from torchcloth.diagnosis.unknown.force_sensitivities import ForcePulses, differentiate_pulses
 from torchcloth.effects import BodyForce
@@ -60,7 +60,7 @@ def planted():
 
 def test_it_is_found_there_and_then(planted):
     found, setting = planted
-    answer = missing_force(found, setting, window=STRETCH)
+    answer = estimate_missing_force(found, setting, window=STRETCH)
     there, elsewhere = answer.motions
     window, vertex = there.strongest
     begin, end = BEGIN / sheet_episodes.RATE, END / sheet_episodes.RATE
@@ -79,7 +79,7 @@ def test_it_is_found_there_and_then(planted):
 
 def test_the_fit_lacks_there_and_not_in_the_other_motion(planted):
     found, setting = planted
-    lacking = {(row.motion, row.kind): row.is_significant for row in measure_lack_of_fit(found, setting.names)}
+    lacking = {(row.motion, row.kind): row.is_significant for row in measure_lack_of_fit(found, setting.motions)}
     assert lacking["slow", "points"]
     assert not lacking["fast", "points"]
 
@@ -88,7 +88,7 @@ def test_pushes_are_those_of_a_body_force(planted):
     """A constant push from the first frame on, against finite differences of a simulation with that force."""
     found, setting = planted
     world, episode = found.model.build_world(), setting.episodes[0]
-    last, count = len(episode.times) - 1, len(setting.rest)
+    last, count = len(episode.times) - 1, len(setting.rest_positions)
     push = torch.zeros(2, 1, count, 3)
     push[:, 0, :, 1] = 1.0
     frames, moved = differentiate_pulses(world, episode, ForcePulses([(0, 5), (5, last)], push))
@@ -122,9 +122,9 @@ def test_where_pushes_grow_without_end_nothing_is_asked(planted, monkeypatch, si
         late = (episode.times - episode.times[0] > 0.5)[:, None, None]
         return frames, moved if episode is not unstable else moved._replace(x=torch.where(late, size, moved.x))
 
-    plain = missing_force(found, setting, window=STRETCH)
+    plain = estimate_missing_force(found, setting, window=STRETCH)
     monkeypatch.setattr(missing, "differentiate_pulses", growing)
-    answer = missing_force(found, setting, window=STRETCH)
+    answer = estimate_missing_force(found, setting, window=STRETCH)
     assert [part.unstable_from for part in answer.motions] == [None, pytest.approx(0.4)]
     assert answer.motions[0].force == pytest.approx(plain.motions[0].force, rel=0.05, abs=0.02 * answer.weight)
     assert bool(answer.motions[1].force.isfinite().all())

@@ -100,7 +100,7 @@ def test_kin_may_be_a_list():
         ({"name": "air.drag_n"}, "which the catalogue has"),
         ({"typical": math.nan}, "typical of 'my.damping'; got nan"),
         ({"typical": math.inf}, "typical of 'my.damping'; got inf"),
-        ({"share": 0.0}, "share of 'my.damping'; got 0"),
+        ({"smallest_fraction": 0.0}, "smallest_fraction of 'my.damping'; got 0"),
     ],
 )
 def test_causes_that_a_search_could_not_use_are_refused(change, said):

@@ -56,8 +56,8 @@ def test_it_predicts_motions_that_were_held_out(without_air):
 def test_laws_are_asked_about_until_nothing_is_lacking(without_air):
     _, answer = without_air
     found = answer.residual.found
-    assert has_lack_of_fit(found.start, found.setting.names)
-    assert bool(found.scores) == has_lack_of_fit(found.end, found.setting.names)
+    assert has_lack_of_fit(found.start, found.setting.motions)
+    assert bool(found.scores) == has_lack_of_fit(found.end, found.setting.motions)
 
 
 @pytest.mark.slow

@@ -7,6 +7,7 @@ import pytest
 import torch
 from helpers import linear_evidence as toys
 
+from torchcloth.diagnosis.decide.criteria import CRITERIA
 from torchcloth.diagnosis.inference import fitting, noise
 from torchcloth.diagnosis.inference.fitting import fit
 from torchcloth.diagnosis.inference.linearise import Linearisation, central_differences
@@ -47,6 +48,7 @@ def test_a_fit_goes_on_where_ripples_change(rippling):
 
 
 def test_without_roughness_it_stays(rippling, monkeypatch):
-    monkeypatch.setattr(noise, "CRITERIA.noise.roughness_steps", 0.0)
+    without_roughness = replace(CRITERIA.noise, roughness_steps=0.0)
+    monkeypatch.setattr(noise, "CRITERIA", replace(CRITERIA, noise=without_roughness))
     found = fit(rippling, None, iterations=8)  # type: ignore[arg-type]
     assert abs(float(found.model.point[0]) - TRUTH) > 4 * float(found.covariance[0, 0]) ** 0.5

@@ -37,11 +37,11 @@ WRONG = {
     ),
     "no numbers": (
         lambda w, a: w.with_observation_transform(lambda frames, e: frames._replace(x=frames.x * math.nan)),
-        "frames that are no numbers",
+        "frames that are not finite",
     ),
     "a factor": (
         lambda w, a: w.with_cloth({"my": effects.MassDamping(5 * (1 + a))}),
-        "from next to nothing of it.*amplitude 0 to be the world as it is",
+        "from a negligible amplitude.*amplitude 0 to be the world as it is",
     ),
 }
 
@@ -97,9 +97,7 @@ def test_no_effect_may_take_the_place_of_the_catalogues(world):
         class Mine(effects.MassDamping):
             """A law of one's own."""
 
-        register(
-            Hypothesis("my.own", "1/s", 1.0, lambda w, a, n_coordinates=Mine, key=name: w.with_cloth({key: own(a)}))
-        )
+        register(Hypothesis("my.own", "1/s", 1.0, lambda w, a, effect=Mine, key=name: w.with_cloth({key: effect(a)})))
         try:
             with pytest.raises(InvalidInput, match=f"named '{name}', as the catalogue calls one of its own"):
                 list_hypotheses(model, recordings)
@@ -113,10 +111,13 @@ def test_no_effect_may_take_the_place_of_the_catalogues(world):
         ({"name": None}, "name of a hypothesis; got None"),
         ({"typical": "1"}, "typical of 'my.own'; got '1'; expected a number"),
         ({"apply": None}, "apply of 'my.own'"),
-        ({"step": 0.0}, "step of 'my.own'"),
-        ({"kin": "obs.clock"}, "kin of 'my.own'; got 'obs.clock'; expected a tuple of names"),
-        ({"low": 0.5}, "low and high of 'my.own'; got 0.5 and inf"),
-        ({"high": 0.5}, "low and high of 'my.own'"),
+        ({"step_fraction": 0.0}, "step_fraction of 'my.own'"),
+        (
+            {"structurally_equivalent": "obs.clock"},
+            "structurally_equivalent of 'my.own'; got 'obs.clock'; expected a tuple of names",
+        ),
+        ({"min_amplitude": 0.5}, "min_amplitude and max_amplitude of 'my.own'; got 0.5 and inf"),
+        ({"max_amplitude": 0.5}, "min_amplitude and max_amplitude of 'my.own'"),
     ],
 )
 def test_what_cannot_be_registered(given, said):

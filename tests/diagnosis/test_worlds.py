@@ -93,7 +93,7 @@ def test_air_and_hem_do_what_their_names_say(made):
 def test_cells_know_what_a_longer_depth_does_to_them(made):
     model, setting = made
     e, by = setting.episodes[0], {h.name: h for h in list_hypotheses(model, [RECORDING])}
-    cells = lambda world: bin_residuals(world.simulate_observed(e), None, e, setting.surface, setting.rest)  # noqa: E731
+    cells = lambda world: bin_residuals(world.simulate_observed(e), None, e, setting.surface, setting.rest_positions)  # noqa: E731
     base, off = cells(model.build_world()), cells(model.build_world([(by["obs.depth_bias"], 1e-4)]))
     seen = base.block < FORCE_BLOCK
     assert torch.equal(base.key, off.key)
@@ -104,7 +104,7 @@ def test_cells_know_what_a_longer_depth_does_to_them(made):
         base.depth_slope.square().mean().sqrt()
     )
     unplaced = bin_residuals(
-        model.build_world().simulate_observed(e), None, replace(e, camera_position=None), setting.surface, setting.rest
+        model.build_world().simulate_observed(e), None, replace(e, camera_position=None), setting.surface, setting.rest_positions
     )
     assert not unplaced.depth_slope.any(), "no camera, or several"
 
@@ -117,7 +117,10 @@ def test_whatever_was_accepted_all_others_still_apply(made, first):
     for h in by.values():
         both = model.build_world([(by[first], by[first].typical), (h, h.typical)])
         changed = digest(cloth_fingerprint_parts(both.cloth)) != digest(cloth_fingerprint_parts(alone.cloth))
-        seen = (len(both.motion_transforms), len(both.observation_transforms)) != (len(alone.motion_transforms), len(alone.observation_transforms))
+        seen = (len(both.motion_transforms), len(both.observation_transforms)) != (
+            len(alone.motion_transforms),
+            len(alone.observation_transforms),
+        )
         assert changed or seen, h.name
 
 

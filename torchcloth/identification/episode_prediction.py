@@ -105,7 +105,7 @@ def predict_episode(
         path: identification.json, or the folder that holds it.
         recording: describes the same kind of cloth. Points, markers and forces are only compared with. An episode
             without any has twenty frames a second.
-        build_start: for a fit that began with a .tcm file: ``diagnosis.start_of(path)``.
+        build_start: for a fit that began with a .tcm file: ``diagnosis.make_start_builder(path)``.
 
     Raises:
         InvalidInput: there is no such file, or the fit is of another model.

@@ -104,7 +104,7 @@ class Identification:
         Args:
             folder: made if it does not exist.
             start_model: .tcm file whose cloth was fitted, if it was one. A copy is stored next to the result, from
-                which ``diagnosis.start_of`` makes that cloth again.
+                which ``diagnosis.make_start_builder`` makes that cloth again.
         """
         folder, content = Path(folder), self.as_dict()
         folder.mkdir(parents=True, exist_ok=True)

@@ -89,7 +89,7 @@ def replay_fit(path: str | Path, recording: Recording, build_start: ClothBuilder
     Args:
         path: identification.json, or the folder that holds it.
         recording: one of the fitted episodes, or another of the same cloth.
-        build_start: for a fit that began with a .tcm file: ``diagnosis.start_of(path)``.
+        build_start: for a fit that began with a .tcm file: ``diagnosis.make_start_builder(path)``.
 
     Raises:
         InvalidInput: there is no such file, or the fit is of another model.
@@ -266,7 +266,7 @@ def rebuild_fitted_cloth(
     absent_tables = {name for name in missing_friction if name.removesuffix(FRICTION_SUFFIX) not in recording.colliders}
     unrecorded = set(fit.unrecorded_settings) if build_start is None else set()
     if different := ((fit.values.keys() - absent_tables) ^ paths.keys()) | unrecorded:
-        with_start = "from Python give build_start=diagnosis.start_of(path)"
+        with_start = "from Python give build_start=diagnosis.make_start_builder(path)"
         raise InvalidInput(
             f"{path}: a fit of another model",
             got=f"{_list_first(sorted(different))} not alike in both",

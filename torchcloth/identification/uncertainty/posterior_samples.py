@@ -32,7 +32,7 @@ def sample_posterior(
         recording: an episode of the same cloth, fitted or not.
         count: number of cloths, the best one included.
         seed: of the random numbers.
-        build_start: for a fit that began with a .tcm file: ``diagnosis.start_of(path)``.
+        build_start: for a fit that began with a .tcm file: ``diagnosis.make_start_builder(path)``.
 
     Raises:
         InvalidInput: there is no such file, or the fit is of another model.
