@@ -15,7 +15,7 @@ OPEN3D_PACKAGES := libusb-1.0-0 libgl1 libegl1 libx11-6 libudev1 libidn2-0 libgo
 .DEFAULT_GOAL := help
 .NOTPARALLEL:
 .DELETE_ON_ERROR:
-.PHONY: help demo test test-slow verify example wheel lint format types clean clean-all
+.PHONY: help demo test test-fast test-slow docs verify example wheel lint format types clean clean-all
 
 help:  ## this list
 	@sed -nE 's/^([a-z-]+):.*## (.*)/  make \1\t\2/p' $(MAKEFILE_LIST) | expand -t 20
@@ -23,8 +23,11 @@ help:  ## this list
 demo: .venv/.installed-demo  ## install the library with its robots and run the demonstration
 	$(BIN)/torchcloth demo
 
-test: .venv/.open3d-works lint types  ## install everything for development, then lint, types and tests
+test: .venv/.open3d-works lint types docs  ## install everything for development, then lint, types, docs and tests
 	$(PYTEST) $(PYTEST_ARGS)
+
+test-fast: .venv/.open3d-works  ## the tests that take less than about a second each: a developer's loop
+	$(PYTEST) -m "not long and not slow and not gpu" $(PYTEST_ARGS)
 
 test-slow: .venv/.open3d-works  ## the tests that take minutes
 	$(PYTEST) -m "slow and not gpu" $(PYTEST_ARGS)
@@ -40,6 +43,9 @@ wheel: .venv/.created  ## a wheel for other Linux machines, engine included: dis
 	rm -rf build
 	TORCHCLOTH_PREBUILD=portable $(PIP) wheel --no-deps --wheel-dir build/wheel .
 	PATH="$(abspath $(BIN)):$$PATH" $(BIN)/auditwheel repair --disable-isa-ext-check --wheel-dir dist build/wheel/*.whl
+
+docs: .venv/.installed-dev  ## build the documentation site strictly, into out/site
+	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --strict --quiet
 
 lint: .venv/.installed-dev  ## style, without changing files
 	$(BIN)/ruff check .

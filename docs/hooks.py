@@ -33,6 +33,17 @@ API_ROOMS = (
 )
 
 
+def on_startup(command: str, dirty: bool) -> None:
+    """Lay out the package as it is installed, for the reader of docstrings: robots/ is ``torchcloth.robots``."""
+    package = ROOT / "out" / "api-source" / "torchcloth"
+    package.mkdir(parents=True, exist_ok=True)
+    for link in package.iterdir():
+        link.unlink()
+    for source in (*(ROOT / "torchcloth").iterdir(), *(ROOT / name for name in ("benchmarks", "robots", "training"))):
+        if source.name != "__pycache__":
+            (package / source.name).symlink_to(source)
+
+
 def on_files(files: Files, config) -> Files:
     """Add the generated pages and the notebooks to the site."""
     pages = {"reference/command-line.md": command_line(), "reference/api.md": api_index()}
@@ -98,9 +109,10 @@ def api_page(room: str) -> str:
         value = getattr(module, name)
         if hasattr(value, "__path__") or type(value).__name__ == "module":
             continue
-        home = getattr(value, "__module__", room) or room
-        path = f"{home}.{name}" if isinstance(value, type) or callable(value) else f"{room}.{name}"
-        text += [f"::: {path}", ""]
+        if callable(value) and getattr(value, "__module__", None):
+            text += [f"::: {value.__module__}.{name}", ""]
+        else:
+            text += [f"## {name}", "", f"`{value!r}`", ""]
     return "\n".join(text) + "\n"
 
 

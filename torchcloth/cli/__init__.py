@@ -102,7 +102,7 @@ def _from_os_error(error: OSError) -> TorchclothError:
 
 def _parse_arguments(arguments: Sequence[str] | None) -> argparse.Namespace:
     """Parse the arguments; unknown options are reported under the verb's name, whose help lists the known ones."""
-    parser = _make_parser()
+    parser = build_parser()
     options, unknown = parser.parse_known_args(arguments)
     if unknown:
         options.verb.error(f"unrecognized arguments: {' '.join(unknown)}")
@@ -116,7 +116,8 @@ class _Parser(argparse.ArgumentParser):
         self.exit(2, f"{self.prog}: {message}; to do: see {self.prog} --help\n")
 
 
-def _make_parser() -> argparse.ArgumentParser:
+def build_parser() -> argparse.ArgumentParser:
+    """Build the parser of the command line, with all verbs; the documentation is generated from it."""
     parser = _Parser(prog="torchcloth", description="Differentiable cloth for robotics.")
     parser.add_argument("--version", action="version", version=metadata.version("torchcloth"))
     verbs = parser.add_subparsers(required=True, metavar="VERB")
