@@ -35,12 +35,12 @@ def threads():
     torch.set_num_threads(before)
 
 
-def all_alike(threads, results):
+def all_alike(threads, run):
     """Twice with one thread and twice with two."""
     results = []
     for count in (1, 1, 2, 2):
         threads(count)
-        results.append(results())
+        results.append(run())
     for other in results[1:]:
         assert all(torch.equal(a, b) for a, b in zip(results[0], other, strict=True))
 
