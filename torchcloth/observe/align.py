@@ -65,7 +65,7 @@ def align(
 ) -> Alignment:
     """Lay a mesh onto a point cloud that shows one side of it.
 
-    The mesh is registered rigidly from many starts and then x_bent. Points pull the nearest visible surface, edges keep
+    The mesh is registered rigidly from many starts and then bent. Points pull the nearest visible surface, edges keep
     their length, curvature is small, and layers that lie on each other stay together, so that hidden layers follow. A
     garment that looks the same from the front and from behind cannot be told from its mirror image: the pose that turns
     ``start`` least is taken.
