@@ -453,6 +453,7 @@ def test_what_the_library_warns_of_is_one_line(monkeypatch, capsys):
     assert warnings.showwarning is before
 
 
+@pytest.mark.slow
 def test_what_is_written_is_there_before_it_is_shown(folder, tmp_path):
     """`| head -1`: nobody reads on, and the files are whole; a folder's name may look like markup, or lead back."""
     for verb in (["inspect", folder], ["identify", folder, *QUICK, "--iterations", "1", "--no-refine"]):

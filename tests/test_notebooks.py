@@ -24,7 +24,13 @@ def test_there_are_notebooks():
     assert NOTEBOOKS
 
 
-@each
+@pytest.mark.parametrize(
+    "path",
+    [
+        pytest.param(path, id=path.stem, marks=pytest.mark.slow if path.stem.startswith("what_") else ())
+        for path in NOTEBOOKS
+    ],
+)  # the second notebook diagnoses for minutes
 def test_it_runs(path, tmp_path, monkeypatch):
     from jupyter_client.manager import AsyncKernelManager
 

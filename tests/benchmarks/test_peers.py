@@ -10,6 +10,8 @@ from torchcloth.benchmarks.contestant import Task, Unsupported
 from torchcloth.benchmarks.ours import TorchclothContestant
 from torchcloth.benchmarks.worker import ContestantFailed, Worker
 
+pytestmark = pytest.mark.slow  # Taichi, Warp, Newton and MuJoCo start up
+
 STEPS = 60
 
 

@@ -66,6 +66,7 @@ def test_the_answer_of_a_resumed_diagnosis_is_the_same(episodes, counted, tmp_pa
     assert torch.equal(again.search.end.covariance, whole.search.end.covariance)
 
 
+@pytest.mark.slow
 def test_another_diagnosis_is_not_resumed(episodes, counted, tmp_path):
     counted["stop"] = 1
     with pytest.raises(KeyboardInterrupt):
@@ -85,6 +86,7 @@ def test_another_diagnosis_is_not_resumed(episodes, counted, tmp_path):
         diagnose(episodes, seen, hypotheses=[], journal=tmp_path / "progress", resume=True)
 
 
+@pytest.mark.slow
 def test_the_command_says_how_to_go_on(episodes, counted, tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(run, "list_hypotheses", lambda *_: [])
     folders = [str(rec.write(e, tmp_path / e.split["motion"])) for e in episodes]

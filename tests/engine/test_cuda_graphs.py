@@ -11,6 +11,8 @@ from torchcloth.engine.cuda_graphs import GraphedRollout, segment_length
 from torchcloth.errors import InvalidInput
 from torchcloth.simulation.rollout import run_schedule
 
+pytestmark = pytest.mark.slow  # CUDA graphs of the torch reference, replayed on the CPU: half a minute
+
 FRAMES = [0.0, 0.02, 0.04, 0.08]
 
 

@@ -66,6 +66,7 @@ def test_doctor_without_a_compiler(nowhere):
     )
 
 
+@pytest.mark.slow
 def test_doctor_before_and_after_the_first_use(nowhere, tmp_path):
     with_path = {**nowhere, "PATH": os.environ["PATH"]}
     done = run(["-m", "torchcloth.cli", "doctor"], **with_path)
@@ -130,6 +131,7 @@ def test_the_name_sees_sources_flags_and_processor(small, monkeypatch):
     assert len(names) == 4
 
 
+@pytest.mark.slow
 def test_two_at_once_build_once(small, capfd):
     """Threads stand for processes: the lock is on an open file of each."""
     made = []
@@ -142,12 +144,14 @@ def test_two_at_once_build_once(small, capfd):
     assert capfd.readouterr().err.count("building the engine") == 1
 
 
+@pytest.mark.slow
 def test_a_compiler_with_arguments(small, monkeypatch):
     monkeypatch.setenv("CXX", "g++ -DTINY")
     assert building.compiler() == ["g++", "-DTINY"]
     assert building.build().exists()
 
 
+@pytest.mark.slow
 def test_where_home_cannot_be_written_to(small, monkeypatch, tmp_path):
     """A file stands where the folder would be: this also stops root, who may write everywhere."""
     (tmp_path / "taken").write_text("")

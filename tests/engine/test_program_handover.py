@@ -13,6 +13,8 @@ import torch
 import torchcloth as tc
 from torchcloth.engine import program
 
+pytestmark = pytest.mark.slow  # processes that fork, and that run out of memory
+
 
 def falling(density):
     mesh = tc.meshes.rectangle(0.1, 0.1, resolution=(3, 4))

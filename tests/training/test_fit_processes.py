@@ -12,6 +12,8 @@ pytest.importorskip("lightning")
 
 from torchcloth.training.fit.command import main
 
+pytestmark = pytest.mark.slow  # two processes of Lightning start up
+
 
 def free_port() -> str:
     """Nobody listens there."""

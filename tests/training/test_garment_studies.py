@@ -140,6 +140,7 @@ def pretended(solved, factor):
     return solve
 
 
+@pytest.mark.slow
 def test_three_studies_share_their_cases(solved, tmp_path, monkeypatch, capsys):
     computed = []
     solve = pretended(solved, 0.95)
@@ -217,6 +218,7 @@ def test_another_setting_needs_another_folder(solved, tmp_path, monkeypatch, cap
     assert "gap" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_a_joint_fit_takes_calm_cases_with_the_same_grips(solved, tmp_path, monkeypatch, capsys):
     fitted = {}
 

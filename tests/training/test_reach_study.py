@@ -30,6 +30,7 @@ def test_the_data_sheet_is_wrong_as_it_says():
     assert scene.stated.plate.stiffness == 0.4 * scene.true.plate.stiffness
 
 
+@pytest.mark.slow
 def test_a_plan_is_carried_out(tmp_path, monkeypatch, capsys):
     """With the data sheet alone: a fit would take minutes, and cloth that hangs hardly asks for one."""
     monkeypatch.setattr(reach, "PLAN_OPTIONS", {"data sheet": {}})
