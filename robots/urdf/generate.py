@@ -89,17 +89,17 @@ LINK_BOXES = {
 
 
 def text(*values: float) -> str:
-    """Numbers as URDF writes them, without losing a bit."""
+    """Return numbers as URDF writes them, without loss of precision."""
     return " ".join(repr(float(value)) for value in values)
 
 
 def add_origin(parent: ET.Element, xyz: tuple, rpy: tuple = (0, 0, 0)) -> None:
-    """Appends an ``origin``."""
+    """Append an ``origin`` element to ``parent``."""
     ET.SubElement(parent, "origin", xyz=text(*xyz), rpy=text(*rpy))
 
 
 def add_link(robot: ET.Element, name: str, inertials: dict, cylinders: dict) -> None:
-    """Appends a link; one that has no figures stays a bare frame: physics engines refuse zero masses."""
+    """Append a link. A link without figures stays a bare frame: physics engines refuse zero masses."""
     link = ET.SubElement(robot, "link", name=name)
     if name in inertials:
         mass, centre, moments = inertials[name]
@@ -118,7 +118,7 @@ def add_link(robot: ET.Element, name: str, inertials: dict, cylinders: dict) -> 
 
 
 def add_cylinder(shape: ET.Element, radius: float, start: tuple, end: tuple) -> None:
-    """Appends a cylinder between two points: URDF centres it and lays it along its own z."""
+    """Append a cylinder between two points [m]. URDF centres a cylinder and lays it along its own z axis."""
     x, y, z = (b - a for a, b in zip(start, end, strict=True))
     across = math.hypot(x, y)
     middle = tuple(round((a + b) / 2, 9) for a, b in zip(start, end, strict=True))
@@ -128,7 +128,7 @@ def add_cylinder(shape: ET.Element, radius: float, start: tuple, end: tuple) -> 
 
 
 def add_joint(robot: ET.Element, name: str, kind: str, parent: str, child: str, xyz: tuple, rpy: tuple) -> ET.Element:
-    """Appends a joint without axis and limits."""
+    """Append a joint without axis and limits."""
     joint = ET.SubElement(robot, "joint", name=name, type=kind)
     add_origin(joint, xyz, rpy)
     ET.SubElement(joint, "parent", link=parent)
@@ -137,7 +137,7 @@ def add_joint(robot: ET.Element, name: str, kind: str, parent: str, child: str, 
 
 
 def add_arm_joint(robot: ET.Element, number: int, variant: Variant) -> None:
-    """Appends ``joint<number>`` with its axis and its hard and soft limits."""
+    """Append ``joint<number>`` with its axis and its hard and soft limits."""
     xyz, yaw, axis, hard, soft, velocity, effort = RIZON_JOINT_TABLE[number - 1]
     pitch = 0.0 if xyz else variant.joint7_pitch
     parent = "base_link" if number == 1 else f"link{number - 1}"
@@ -151,7 +151,7 @@ def add_arm_joint(robot: ET.Element, number: int, variant: Variant) -> None:
 
 
 def render(name: str) -> str:
-    """The URDF text of one of ``RIZON_VARIANTS``."""
+    """Return the URDF text of one of ``RIZON_VARIANTS``."""
     variant = RIZON_VARIANTS[name]
     link7 = (variant.link7_mass, (0, 0, variant.link7_com), (0.001, 0.001, 0.001, 0, 0, 0))
     inertials = LINK_INERTIALS | {"link7": link7}

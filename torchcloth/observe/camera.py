@@ -19,12 +19,12 @@ class Calibration(Protocol):
 
     @property
     def width(self) -> int:
-        """Image width [px]."""
+        """Width of the images [px]."""
         ...
 
     @property
     def height(self) -> int:
-        """Image height [px]."""
+        """Height of the images [px]."""
         ...
 
     @property

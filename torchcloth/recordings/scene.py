@@ -82,7 +82,7 @@ def read_grasp(fields: Fields) -> GraspInfo:
 
 
 def read_robot(fields: Fields) -> RobotInfo:
-    """Read one robot."""
+    """Read one entry of ``robots``."""
     model, base = fields.text("model"), _transform(fields, "T_world_base")
     return RobotInfo(model, base, fields.optional(fields.text, "tool_frame"), fields.unknown_keys())
 

@@ -209,7 +209,7 @@ class ClosedTopic:
         self._events: list[tuple[int, bool]] = []
 
     def take(self, message: BagMessage) -> None:
-        """Store a change."""
+        """Store one change of the gripper's state."""
         self._events.append((message.log_time, bool(message.body.data)))
 
     def at(self, logged: list[int], place: str) -> np.ndarray | None:
@@ -225,7 +225,7 @@ class ClosedTopic:
 
 
 class CloudTopic:
-    """Segmented cloth points."""
+    """Reader of a topic with segmented cloth points."""
 
     def __init__(self, fields: Fields, bag: Bag, scene: Sidecar) -> None:
         self.place = fields.place
