@@ -60,13 +60,13 @@ def test_hidden_drag_is_named(with_drag):
     assert gain["explained_fraction"] > 0.9
     assert [row["motion"] for row in gain["per_motion"]] == list(sheet_episodes.MOTIONS)
     assert all(row["rms_after"] < row["rms_before"] for row in gain["per_motion"])
-    for share, ends in (("explained_fraction", "ci95"), ("log_density", "log_density_ci95")):
+    for share, ends in (("explained_fraction", "explained_fraction_ci95"), ("log_density", "log_density_ci95")):
         assert all(row[ends][0] <= row[share] <= row[ends][1] for row in gain["per_motion"])
     squares = [[row[key] ** 2 for row in gain["per_motion"]] for key in ("rms_before", "rms_after")]
     assert min(squares[0]) < gain["rms_before"] ** 2 < max(squares[0])
     assert min(squares[1]) < gain["rms_after"] ** 2 < max(squares[1])
     assert "Cause: air.drag_n" in answer.summary()
-    assert "of what could be explained" in answer.summary()
+    assert "of what can be explained" in answer.summary()
     assert answer.content["parameters"]["stiffening"]["ci95"][0] >= 0  # a number's interval ends where the number does
 
 
@@ -90,7 +90,7 @@ def test_the_cloud_is_shown_over_both_models_where_the_first_is_farthest_off(wit
         assert np.array_equal(o.points.numpy(), own)
         before, after = (float(d.mean()) for d in o.distances)
         assert after < (1.05 if o.motion == "lift" else 0.25) * before  # lifted, drag hardly shows
-    figure = draw_cloud_overlays(answer.overlays, answer.found.setting.surface.faces.numpy())
+    figure = draw_cloud_overlays(answer.overlays, answer.search.data.surface.faces.numpy())
     assert len(figure.axes) == 2 * len(answer.overlays) + 1
     assert "with causes" in figure.axes[-2].get_title()
 
@@ -122,7 +122,12 @@ def test_rivals_that_no_motion_would_tell_apart_are_warned_of(with_drag, monkeyp
     recordings, answer = with_drag
     open_ = replace(answer, verdict=verdict)
     proposal = None if following is None else Proposal(following, recordings[0])
-    for name, result in (("search", None), ("doubted", None), ("_judged", open_), ("propose", proposal)):
+    for name, result in (
+        ("search", None),
+        ("check_against_laws", None),
+        ("_judge_with_unknowns", open_),
+        ("propose_experiment", proposal),
+    ):
         monkeypatch.setattr(run, name, lambda *_, result=result: result)
     found = diagnose(recordings, hypotheses=[])
     content = found.content
@@ -141,10 +146,10 @@ def test_the_answer_is_written_and_its_model_is_a_layer(with_drag, tmp_path):
     )
     page = (tmp_path / "report.html").read_text()
     assert page.count("data:image/png;base64,") == 5
-    assert "<th>motion held out</th>" in page
+    assert "<th>held-out motion</th>" in page
     assert "http" not in page  # self-contained
-    assert "<th>matters from</th><th>shows from</th>" in page
-    assert "(not zero)" in page
+    assert "<th>smallest effect of interest</th><th>detectable from</th>" in page
+    assert "which is not zero" in page
     world = load_model(tmp_path / content["model"]).build_world()
     assert float(world.cloth.effects["air"].normal.value) == pytest.approx(content["causes"][0]["amplitude"])
 

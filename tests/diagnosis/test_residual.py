@@ -44,10 +44,10 @@ def without_air():
 def test_it_predicts_motions_that_were_held_out(without_air):
     _, answer = without_air
     assert answer.verdict == "unexplained"
-    assert answer.residual.gain.after < 0.4 * answer.residual.gain.before
-    told = answer.content["residual"]
-    assert "opposes motion across the cloth" in told["terms"][0]["told"]
-    assert [step["kept"] for step in told["path"]] == list(answer.residual.terms)
+    assert answer.residual_force.gain.rms_after < 0.4 * answer.residual_force.gain.rms_before
+    told = answer.content["residual_force"]
+    assert "opposes motion across the cloth" in told["terms"][0]["description"]
+    assert [step["accepted"] for step in told["path"]] == list(answer.residual_force.terms)
     assert "It names no cause." in answer.summary()
     assert answer.content["causes"] == []
 
@@ -55,17 +55,17 @@ def test_it_predicts_motions_that_were_held_out(without_air):
 @pytest.mark.slow
 def test_laws_are_asked_about_until_nothing_is_lacking(without_air):
     _, answer = without_air
-    found = answer.residual.found
-    assert has_lack_of_fit(found.start, found.setting.motions)
-    assert bool(found.scores) == has_lack_of_fit(found.end, found.setting.motions)
+    found = answer.residual_force.search
+    assert has_lack_of_fit(found.start, found.data.motions)
+    assert bool(found.scores) == has_lack_of_fit(found.end, found.data.motions)
 
 
 @pytest.mark.slow
 def test_the_missing_force_takes_power(without_air):
     _, answer = without_air
-    fast = answer.missing.parts[1]
+    fast = answer.missing_force.motions[1]
     velocity = torch.gradient(fast.x, spacing=(fast.windows.mean(1),), dim=0)[0]
-    assert float((fast.force * velocity * answer.missing.area[:, None]).sum()) < 0
+    assert float((fast.force * velocity * answer.missing_force.area[:, None]).sum()) < 0
 
 
 @pytest.mark.slow
@@ -77,7 +77,7 @@ def test_it_is_written_with_the_answer(without_air, tmp_path):
     assert len(content["missing_force"]["motions"]) == len(MOTIONS)
     assert "The force that is missing" in (tmp_path / "report.html").read_text()
     loaded = load_model(tmp_path / content["model"])
-    assert torch.equal(loaded.point, answer.residual.model.point)
+    assert torch.equal(loaded.point, answer.residual_force.model.point)
 
 
 def test_it_is_kept_with_the_model_and_can_be_left_out(tmp_path):

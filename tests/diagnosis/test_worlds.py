@@ -13,16 +13,15 @@ from torchcloth._utils.resume import digest
 from torchcloth.diagnosis.causes import air, fabric, grip, observer
 from torchcloth.diagnosis.causes.hypotheses import list_hypotheses, register, unregister
 from torchcloth.diagnosis.data.binning import BLOCK_NAMES as NAMES_OF_DATA
-from torchcloth.diagnosis.data.binning import FORCE_BLOCK, _average, _places, bin_residuals
+from torchcloth.diagnosis.data.binning import FORCE_BLOCK, _average, _part_positions, bin_residuals
 from torchcloth.diagnosis.data.dataset import (
     MAX_CLOCK_DELAY_S,
     MAX_POINTS_PER_FRAME,
-    _telling,
+    _check_informative,
     label_motions,
     prepare_data,
 )
 from torchcloth.diagnosis.data.fine_mesh import refine_model
-from torchcloth.diagnosis.decide.criteria import CRITERIA
 from torchcloth.diagnosis.models.base_model import UNSTATED_PRIOR_STD, build_base_model
 from torchcloth.diagnosis.models.model_file import load_model, save_model
 from torchcloth.diagnosis.report.wording import warn_of_implied_amplitudes
@@ -42,7 +41,7 @@ RECORDING = sheet_episodes.episode()
 EVERY = [*air.HYPOTHESES, *fabric.HYPOTHESES, *grip.HYPOTHESES, *observer.HYPOTHESES]
 NAMES = [h.name for h in EVERY if h.is_applicable(RECORDING)]
 # of which a gentle swing shows nothing: tests of their own have scenes for them
-CRITERIA.candidate.simulator_tolerance = (
+HARDLY_VISIBLE = (
     "air.drag_t",
     "damp.kv",
     "plast.crease",
@@ -67,7 +66,7 @@ def test_nothing_at_zero_and_twice_as_much_at_twice(made, name):
     moved = [(model.build_world([(h, s * h.typical)]).simulate_observed(e), s) for s in share]
     small, twice = ((f.x - base.x).norm() + (f.edge - base.edge).norm() for f, _ in moved)
     shows = float(twice) > 1e-4  # m, of all vertices and frames together: else the substep, chosen anew, does
-    assert shows == (name not in CRITERIA.candidate.simulator_tolerance), float(twice)
+    assert shows == (name not in HARDLY_VISIBLE), float(twice)
     if shows:
         assert float(twice / small) == pytest.approx(2.0, rel=0.15)
 
@@ -104,7 +103,11 @@ def test_cells_know_what_a_longer_depth_does_to_them(made):
         base.depth_slope.square().mean().sqrt()
     )
     unplaced = bin_residuals(
-        model.build_world().simulate_observed(e), None, replace(e, camera_position=None), setting.surface, setting.rest_positions
+        model.build_world().simulate_observed(e),
+        None,
+        replace(e, camera_position=None),
+        setting.surface,
+        setting.rest_positions,
     )
     assert not unplaced.depth_slope.any(), "no camera, or several"
 
@@ -159,7 +162,7 @@ def test_what_a_recording_cannot_show_is_not_asked(made):
 def test_parts_of_the_fabric_that_have_no_vertex_are_where_the_nearest_is():
     mesh = rectangle(0.3, 0.3, resolution=(3, 3))
     rest = torch.as_tensor(mesh.vertices)
-    places = _places("points", build_surface_of_mesh(mesh), rest)
+    places = _part_positions("points", build_surface_of_mesh(mesh), rest)
     assert places.shape == (16, 3)
     assert sorted(places[[0, 2, 8, 10]].tolist()) == sorted(rest[[0, 1, 3, 4]].tolist())
     assert places[5].tolist() in rest.tolist(), "between vertices on the coarse mesh"
@@ -236,8 +239,8 @@ def test_windows_do_not_run_into_the_next_part_of_the_fabric(made):
     """Known before anything is simulated, which then takes minutes."""
     (e,) = made[1].episodes
     with pytest.raises(InvalidInput, match="of 250 s; expected less than 200 s; cut it"):
-        _telling(replace(e, times=torch.linspace(0.0, 250.0, len(e.times))))
-    _telling(replace(e, times=torch.linspace(0.0, 199.0, len(e.times))))
+        _check_informative(replace(e, times=torch.linspace(0.0, 250.0, len(e.times))))
+    _check_informative(replace(e, times=torch.linspace(0.0, 199.0, len(e.times))))
 
 
 def test_dense_clouds_are_thinned_alike_on_both_meshes(made):
@@ -374,10 +377,14 @@ def test_a_table_that_one_episode_names_is_there_in_all():
 def test_a_table_that_leans_or_stands_rubs_otherwise_along_an_axis_of_its_own(normal):
     plane = Collider(np.zeros(3), np.array(normal) / np.linalg.norm(normal), 0.4)
     model = build_base_model(replace(RECORDING, colliders={"table": plane}))
-    law = grip._friction(model.build_world(), along=-0.5).cloth.boundaries["table"].friction
+    law = grip._change_friction(model.build_world(), along=-0.5).cloth.boundaries["table"].friction
     assert abs(float(law.axis @ torch.as_tensor(plane.normal).to(law.axis))) < 1e-5
     assert law.ratio.value.item() == pytest.approx(2.0)
-    again = grip._friction(grip._friction(model.build_world(), along=-0.5), more=0.1).cloth.boundaries["table"].friction
+    again = (
+        grip._change_friction(grip._change_friction(model.build_world(), along=-0.5), more=0.1)
+        .cloth.boundaries["table"]
+        .friction
+    )
     assert torch.allclose(again.axis, law.axis)
 
 
