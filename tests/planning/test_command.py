@@ -55,7 +55,7 @@ def test_writes_what_was_planned(folder, goal, tmp_path, capsys):
     assert main(["plan", str(folder), "--goal", str(goal), "--out", str(out), *OPTIONS]) == 0
     words = json.loads((out / "plan.json").read_text())
     assert words["distance"]["after"][0] < 0.3 * words["distance"]["before"][0]
-    assert words["limit"]["what"].endswith("of arm")
+    assert words["nearest_limit"]["limit"].endswith("of arm")
     assert words["warnings"] == []
     planned = rec.read(out / "episode")
     assert planned.provenance == PLANNED_PROVENANCE

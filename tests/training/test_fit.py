@@ -77,7 +77,8 @@ def same(one, two):
 
 def test_it_learns_the_fabric(config, tmp_path):
     """The points lie on the true sheet: E goes from 80 kPa towards 40, and loads back without the data."""
-    path = config(learn={"parameters": ["youngs_modulus"]}, optimizer={"rate": 0.15, "steps": 20, "half_life": 6})
+    optimizer = {"learning_rate": 0.15, "steps": 20, "half_life": 6}
+    path = config(learn={"parameters": ["youngs_modulus"]}, optimizer=optimizer)
     assert main(["--config", path]) == 0
     content = json.loads((tmp_path / "out" / "fit.json").read_text())
     entry = content["parameters"]["youngs_modulus"]
@@ -300,4 +301,4 @@ def test_a_stopped_run_promises_only_its_own_checkpoint(config, monkeypatch, cap
     monkeypatch.setattr(run, "fit", stopped)
     for options, promised in ((["--resume"], True), (["optimizer.learning_rate=0.2"], False)):
         assert main(["--config", path, *options]) == 130
-        assert ("goes on after" in capsys.readouterr().err) == promised
+        assert ("continues after" in capsys.readouterr().err) == promised

@@ -10,6 +10,7 @@ import pytest
 import torchcloth
 from torchcloth import meshes, recordings
 from torchcloth.errors import MissingDependency
+from torchcloth.identification.result import IDENTIFICATION_SCHEMA
 from torchcloth.observe.render import import_open3d
 from torchcloth.viewing import ClothSurface, Cloud, Curve, Film, GripperPath, GroundPlane, RigidBody
 
@@ -84,9 +85,11 @@ def short(tmp_path_factory, example):
     xyz = recordings.read(folder).points.xyz
     mark = {"name": "swing", "frames": FRAMES, "points": len(xyz), "mean": xyz.mean(0).tolist(), "chamfer": 0.001}
     fit = folder.parent / "identification.json"
-    model = {"values": VALUES, "contact": None, "dt": None, "episodes": [mark]}
-    message = {"youngs_modulus": {"std": 100.0, "identifiable": True, "source": "data"}}
+    model = {"values": VALUES, "thickness": None, "contact": None, "dt": None, "episodes": [mark]}
+    model["unrecorded_settings"] = []
+    message = {"youngs_modulus": {"initial": 5e4, "value": 51294.0, "std": 100.0, "source": "data"}}
     result = {
+        "schema": IDENTIFICATION_SCHEMA,
         "parameters": message,
         "correlation": {name: {name: 1.0} for name in message},
         "fit": {"rms_after": 0.0012},

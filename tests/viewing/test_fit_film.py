@@ -158,8 +158,8 @@ def test_an_episode_that_was_not_fitted_is_a_prediction(short):
 
 BROKEN = {
     "no json": (lambda c: "{", "unreadable"),
-    "an older file": (lambda c: json.dumps({"parameters": {}}), "does not say which model was fitted"),
-    "a list": (lambda c: "[]", "does not say which model was fitted"),
+    "an older file": (lambda c: json.dumps({"parameters": {}}), "schema; got none"),
+    "a list": (lambda c: "[]", "schema; got none"),
     "a word for a number": (lambda c: json.dumps(c).replace("0.0665", '"soft"'), "does not say which model"),
     "wrong contact": (
         lambda c: json.dumps(c).replace('"contact": null', '"contact": {"gap": 1}'),

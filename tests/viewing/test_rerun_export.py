@@ -155,7 +155,7 @@ def test_a_lens_is_taken_out_for_the_pinhole(bent, tmp_path, needs_open3d):
     buffer = result["/world/cam/depth"]["DepthImage:buffer"][0][0]
     depth = 1e-4 * np.frombuffer(bytes(buffer), np.uint16).reshape(48, 64)
     expected = wall(lens.without_distortion().pixel_rays)
-    assert np.abs(expected - wall(lens.grid)).max() > 0.02  # what came of it under the pinhole as it was
+    assert np.abs(expected - wall(lens.pixel_rays)).max() > 0.02  # what came of it under the pinhole as it was
     seen = depth > 0
     assert seen.mean() > 0.9
     np.testing.assert_allclose(depth[seen], expected[seen], rtol=0, atol=1e-3)
