@@ -35,6 +35,7 @@ WRONG = {
         ["--out", "a.gif", "--fps", "90", "--fit", "nowhere"],
         "rate; got 90.0; expected up to 50",
     ),
+    "before without a fit": (["--out", "a.gif", "--before"], "--before; got no --fit, or no .gif; expected --fit"),
     "port and file": (["--out", "a.gif", "--port", "9000"], "--port; got 9000; expected 1 to 65535, without --out"),
     "impossible port": (["--port", "70000"], "--port; got 70000"),
     "no fit": (["--out", "a.gif", "--fit", "nowhere"], "fit; got no nowhere"),

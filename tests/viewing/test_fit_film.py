@@ -139,6 +139,13 @@ def test_the_fit_is_simulated_again(fitted, short):
     assert f"fitted, {distance.values.mean():.2f} mm" in fitted.title
 
 
+def test_the_start_of_a_fit_is_farther_from_the_points(fitted, short):
+    start = film_from_fit(recordings.read(short[0]), short[1], at_start=True)
+    assert "start values" in start.title
+    np.testing.assert_array_equal(start.times, fitted.times)
+    assert np.nanmean(start.curves["distance"].values) > np.nanmean(fitted.curves["distance"].values)
+
+
 def test_a_replay_that_is_not_the_fits_is_said(spoiled):
     folder, path, content = spoiled
     content["model"]["episodes"][0]["chamfer"] = 0.003

@@ -183,6 +183,16 @@ def test_a_gif_plays_in_real_time(film, tmp_path):
     assert [p.name for p in path.parent.iterdir()] == ["a.gif"]
 
 
+def test_two_films_play_side_by_side_from_one_eye(film, tmp_path):
+    path = write_gif(film, tmp_path / "a.gif", size=(240, 200), left=film)
+    with Image.open(path) as gif:
+        assert (gif.size, gif.n_frames) == ((480, 200), 6)
+        pixels = np.asarray(gif.convert("RGB"))
+    np.testing.assert_array_equal(pixels[:, :240], pixels[:, 240:])
+    with pytest.raises(InvalidInput, match="at other times"):
+        write_gif(film, tmp_path / "b.gif", left=film.select_frames(np.arange(3)))
+
+
 def test_durations_are_hundredths_whose_sum_is_right():
     times = np.arange(31) / 30  # 33.3 ms
     result = _durations(times)

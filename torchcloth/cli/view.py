@@ -34,6 +34,11 @@ def add(verbs: Any) -> None:
         metavar="FILE",
         help="a .gif, .png, .rrd (rerun), .html or .viser file (default: serve the scene to a browser)",
     )
+    view.add_argument(
+        "--before",
+        action="store_true",
+        help="with --fit and a .gif: also show the simulation with the start values, on the left",
+    )
     view.add_argument("--truth", action="store_true", help="also show the true cloth of a synthetic episode")
     view.add_argument("--port", type=int, metavar="N", help=f"port of the local server (default: {DEFAULT_PORT})")
     view.add_argument("--fps", type=float, metavar="N", help="most frames per second (default: all; 25 in a GIF)")
@@ -49,7 +54,7 @@ def _view(options: argparse.Namespace) -> int:
     if options.out is None:
         return _serve(film, options.port or DEFAULT_PORT)
     note = replacement_note(options.out)
-    _write(film, options.out, size, options.fps)
+    _write(film, options.out, size, options.fps, _film(options, at_start=True) if options.before else None)
     print(f"{options.out}: {options.out.stat().st_size / 1e3:.0f} kB{note}")
     return 0
 
@@ -69,6 +74,8 @@ def _check_options(options: argparse.Namespace) -> tuple[int, int] | None:
         raise InvalidInput("--port", got=options.port, expected="1 to 65535, without --out")
     if options.fps is not None and not 0 < options.fps < float("inf"):
         raise InvalidInput("--fps", got=options.fps, expected="a number > 0")
+    if options.before and (options.fit is None or suffix != ".gif"):
+        raise InvalidInput("--before", got="no --fit, or no .gif", expected="--fit RESULT and --out FILE.gif")
     if options.fps is not None and suffix == ".gif":
         from ..viewing.image_files import check_gif_rate
 
@@ -87,7 +94,7 @@ def _check_options(options: argparse.Namespace) -> tuple[int, int] | None:
     return check_image_size((int(match[1]), int(match[2])))
 
 
-def _film(options: argparse.Namespace) -> Film:
+def _film(options: argparse.Namespace, at_start: bool = False) -> Film:
     import torch
 
     from .. import recordings, viewing
@@ -98,11 +105,11 @@ def _film(options: argparse.Namespace) -> Film:
     if options.fit is None:
         film = viewing.film_from_recording(recording, truth=options.truth)
     else:
-        film = viewing.film_from_fit(recording, options.fit, truth=options.truth)
+        film = viewing.film_from_fit(recording, options.fit, truth=options.truth, at_start=at_start)
     return film if options.fps is None else film.limit_rate(options.fps)
 
 
-def _write(film: Film, out: Path, size: tuple[int, int] | None, fps: float | None) -> None:
+def _write(film: Film, out: Path, size: tuple[int, int] | None, fps: float | None, left: Film | None) -> None:
     from rich.progress import Progress
 
     from .. import viewing
@@ -116,6 +123,7 @@ def _write(film: Film, out: Path, size: tuple[int, int] | None, fps: float | Non
                 out,
                 size=size,
                 rate=fps or viewing.DEFAULT_GIF_RATE_HZ,
+                left=left,
                 on_frame=lambda done, total: progress.update(task, completed=done, total=total),
             )
     elif suffix == ".png":

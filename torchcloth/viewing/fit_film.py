@@ -12,6 +12,7 @@ from ..diagnosis import make_start_builder, read_model
 from ..diagnosis.models.loading import simulate_frames
 from ..episodes.observed import DEFAULT_FRAME_RATE_HZ, build_episode
 from ..episodes.streams import SAME_TIME_S
+from ..errors import InvalidInput
 from ..identification import replay_fit
 from ..losses import find_closest_points
 from ..recordings import Recording
@@ -26,25 +27,29 @@ MIN_POINT_DENSITY_RATIO = 0.2  # of the mean density of points; a vertex with fe
 MAX_SPREAD_STEPS = 30
 
 
-def film_from_fit(recording: Recording, fit: str | Path, *, truth: bool = False) -> Film:
+def film_from_fit(recording: Recording, fit: str | Path, *, truth: bool = False, at_start: bool = False) -> Film:
     """Make a film of an episode and of the cloth simulated with fitted values, coloured by distance.
 
     Args:
         recording: an episode of the fit, or another episode of the same cloth, which is then predicted.
         fit: identification.json, the folder that contains it, or a .tcm file of ``diagnose``.
         truth: see ``film_from_recording``.
+        at_start: simulate with the values that the search started from instead of the fitted ones.
 
     Raises:
-        InvalidInput: the fit belongs to another model.
+        InvalidInput: the fit belongs to another model, or the start of a .tcm file is asked for.
         RecordingError: the file cannot be read.
     """
     if Path(fit).suffix == MODEL_SUFFIX:
+        if at_start:
+            raise InvalidInput("start values", got=str(fit), expected="identification.json, which holds them")
         return _film_from_model(recording, fit, truth)
-    replay = replay_fit(fit, recording, make_start_builder(fit))
+    replay = replay_fit(fit, recording, make_start_builder(fit), at_start=at_start)
     film = film_from_recording(recording, truth=truth, times=replay.episode.times.numpy())
     film = _add_cloth_at_point_times(film, recording, replay.frames.numpy(), replay.cloth.mesh.faces)
     distance = f", {1e3 * float(replay.chamfer.mean()):.2f} mm from the points" if len(replay.chamfer) else ""
-    title = f"{film.title}: {'fitted' if replay.was_fitted else 'predicted'}{distance}"
+    state = "start values" if at_start else "fitted" if replay.was_fitted else "predicted"
+    title = f"{film.title}: {state}{distance}"
     return replace(film, title=title, notes=film.notes + ((replay.warning,) if replay.warning else ()))
 
 

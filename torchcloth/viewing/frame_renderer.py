@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from ..errors import InvalidInput
+from ..observe import DepthCamera
 from .colours import get_colour_map
 from .film import DISTANCE_CURVE, GRID_CELL_M, Film, GroundPlane, ground_planes
 from .geometry import Array
@@ -30,12 +31,19 @@ class FrameRenderer:
         film: what to show.
         size: (width, height) pixels.
         look: (azimuth, elevation) of the eye [degrees]; None: chosen from the film.
+        camera: a camera of this size that another renderer made; None: one that fits the film.
 
     Raises:
         InvalidInput: the size is too small or too large.
     """
 
-    def __init__(self, film: Film, size: tuple[int, int], look: tuple[float, float] | None = None) -> None:
+    def __init__(
+        self,
+        film: Film,
+        size: tuple[int, int],
+        look: tuple[float, float] | None = None,
+        camera: DepthCamera | None = None,
+    ) -> None:
         from matplotlib.backends.backend_agg import FigureCanvasAgg
         from matplotlib.figure import Figure
 
@@ -52,7 +60,7 @@ class FrameRenderer:
         bar = COLOUR_BAR_WIDTH_FRACTION if film.has_values else 0.0
         self.axes = self.figure.add_axes((0, strip, 1 - bar, 1 - strip))
         inner = (round(width * (1 - bar)), round(height * (1 - strip)))
-        self.camera = fit_camera(film, inner, look)
+        self.camera = camera or fit_camera(film, inner, look)
         self.axes.set(xlim=(-0.5, inner[0] - 0.5), ylim=(inner[1] - 0.5, -0.5))
         self.axes.axis("off")
         self.ground = ground_planes(film)

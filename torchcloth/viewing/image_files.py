@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -30,6 +31,7 @@ def write_gif(
     rate: float = DEFAULT_GIF_RATE_HZ,
     look: tuple[float, float] | None = None,
     on_frame: Callable[[int, int], None] | None = None,
+    left: Film | None = None,
 ) -> Path:
     """Write a film as a GIF that plays in real time.
 
@@ -40,22 +42,30 @@ def write_gif(
         rate: most frames per second, up to 50.
         look: (azimuth, elevation) of the eye [degrees]; None: chosen from the film.
         on_frame: called with (frames done, all frames).
+        left: another film of the same frames, shown on the left from the same eye with the same colours, for example
+            the simulation before a fit.
 
     Returns:
         ``path``.
 
     Raises:
-        InvalidInput: a rate that no GIF can have, or a size that is too small or too large.
+        InvalidInput: a rate that no GIF can have, a size that is too small or too large, or films of other times.
     """
     from PIL import Image
 
     check_gif_rate(rate)
-    film = film.limit_rate(rate)
-    renderer = FrameRenderer(film, size or GIF_SIZE_PX, look)
-    palette = _palette(renderer)
+    if left is not None and not np.array_equal(left.times, film.times):
+        raise InvalidInput("left", got=f"{len(left)} frames at other times", expected="the times of the film")
+    film, left = film.limit_rate(rate), None if left is None else left.limit_rate(rate)
+    right = FrameRenderer(film, size or GIF_SIZE_PX, look)
+    renderers = [right]
+    if left is not None:
+        left = replace(left, colour_limit=film.colour_limit)
+        renderers.insert(0, FrameRenderer(left, size or GIF_SIZE_PX, look, right.camera))
+    palette = _palette(renderers)
     images = []
     for frame in range(len(film)):
-        pixels = Image.fromarray(renderer.pixels(frame))
+        pixels = Image.fromarray(np.concatenate([renderer.pixels(frame) for renderer in renderers], axis=1))
         images.append(pixels.quantize(palette=palette, dither=Image.Dither.NONE))
         if on_frame is not None:
             on_frame(frame + 1, len(film))
@@ -104,12 +114,12 @@ def write_png(
     return Path(path)
 
 
-def _palette(renderer: FrameRenderer) -> Any:
+def _palette(renderers: Sequence[FrameRenderer]) -> Any:
     """Return one palette for all frames, from three of them; parts that do not move then take no space."""
     from PIL import Image
 
-    shown = np.unique(np.linspace(0, len(renderer.film) - 1, 3).round().astype(int))
-    samples = np.concatenate([renderer.pixels(int(frame)) for frame in shown])
+    shown = np.unique(np.linspace(0, len(renderers[0].film) - 1, 3).round().astype(int))
+    samples = np.concatenate([renderer.pixels(int(frame)) for renderer in renderers for frame in shown])
     return Image.fromarray(samples).quantize(GIF_COLOURS, method=Image.Quantize.MAXCOVERAGE, dither=Image.Dither.NONE)
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -83,19 +83,24 @@ def describe_model(
     }
 
 
-def replay_fit(path: str | Path, recording: Recording, build_start: ClothBuilder | None = None) -> ReplayedEpisode:
+def replay_fit(
+    path: str | Path, recording: Recording, build_start: ClothBuilder | None = None, *, at_start: bool = False
+) -> ReplayedEpisode:
     """Simulate an episode with the values of a fit.
 
     Args:
         path: identification.json, or the folder that holds it.
         recording: one of the fitted episodes, or another of the same cloth.
         build_start: for a fit that began with a .tcm file: ``diagnosis.make_start_builder(path)``.
+        at_start: simulate with the values that the search started from instead of the fitted ones.
 
     Raises:
         InvalidInput: there is no such file, or the fit is of another model.
         RecordingError: the file cannot be read, or does not hold what is needed.
     """
     fit = read_saved_fit(path)
+    if at_start:
+        fit = replace(fit, values=fit.values | fit.start_values)
     recording_fingerprint = fingerprint(recording)
     fitted_chamfers = [e["chamfer"] for e in fit.episodes if same_episode(e, recording_fingerprint)]
     cloth = rebuild_fitted_cloth(path, fit, recording, build_start)
@@ -104,7 +109,7 @@ def replay_fit(path: str | Path, recording: Recording, build_start: ClothBuilder
         frames = Replay(cloth)(data, fit.dt).x
     metrics = distance_metrics([frames], [data], torch.as_tensor(cloth.mesh.faces))
     warning = ""
-    if fitted_chamfers:
+    if fitted_chamfers and not at_start:
         before = fitted_chamfers[0]
         if abs(metrics.chamfer - before) > REPLAY_RELATIVE_TOLERANCE * before:
             warning = (
@@ -149,6 +154,7 @@ class SavedFit:
 
     Attributes:
         values: by name, fitted or not.
+        start_values: of the fitted parameters, where the search started.
         stds: standard errors of the fitted parameters, by name.
         unrecorded_settings: names of settings of the fitted cloth that its first episode does not describe.
         has_start_model: whether the fit began with a .tcm file, a copy of which lies in the same folder.
@@ -161,6 +167,7 @@ class SavedFit:
     """
 
     values: dict[str, float]
+    start_values: dict[str, float]
     stds: dict[str, float]
     unrecorded_settings: list[str]
     has_start_model: bool
@@ -213,6 +220,7 @@ def _parse_fit(content: dict[str, Any]) -> SavedFit:
     misfit, thickness = content["fit"]["rms_after"], model["thickness"]
     return SavedFit(
         values={str(name): _parse_value(name, value) for name, value in model["values"].items()},
+        start_values={name: _parse_value(name, parameters[name]["initial"]) for name in correlation},
         stds={name: check_number(parameters[name]["std"], 0.0, f"{name}'s std") for name in correlation},
         unrecorded_settings=[str(name) for name in model["unrecorded_settings"]],
         has_start_model="start_model" in model,
