@@ -13,7 +13,7 @@ from ..recordings.timing import GAP_FACTOR, stream_times
 from .inspect_recording import Inspection
 
 DATA_COLOUR, WARNING_COLOUR, MUTED_COLOUR = "#1f6f8b", "#b0653a", "#888888"
-MAX_DRAWN_POINTS = 3000  # of one frame
+MAX_POINTS_PER_PANEL = 3000  # of one frame
 
 
 def draw(report: Inspection, folder: str | Path) -> Path:
@@ -125,7 +125,7 @@ def _frame(axis: Any, report: Inspection, kind: str, i: int) -> None:
     stream = getattr(recording, kind)
     cloud = stream.xyz[i] if kind == "markers" else stream.frame(i)
     cloud = cloud[np.isfinite(cloud[:, 0])]
-    cloud = cloud[:: max(1, len(cloud) // MAX_DRAWN_POINTS)]
+    cloud = cloud[:: max(1, len(cloud) // MAX_POINTS_PER_PANEL)]
     t = stream.t[i] + _observation_to_motion_s(report)
     axis.scatter(*cloud.T, s=6 if len(cloud) < 500 else 1, color=DATA_COLOUR, depthshade=False)
     extents = [cloud]

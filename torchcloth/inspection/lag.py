@@ -19,7 +19,7 @@ RESIDUAL_SCALE_M = 5e-3  # above, residuals count linearly instead of quadratica
 GRIPPED_MARKER_FRACTION = 0.1  # of the markers, the nearest ones, are assumed to be gripped
 MIN_SAMPLES = 3  # of markers, frames and candidates
 GRIPPED_POINTS = 5  # of a cloud, the nearest ones, whose mean is assumed to be gripped
-MAX_LAG_FRAMES, MAX_POINTS_PER_FRAME = 300, 1000  # used, evenly chosen
+MAX_LAG_FRAMES, MAX_LAG_POINTS_PER_FRAME = 300, 1000  # used, evenly chosen
 JACKKNIFE_BLOCKS = 10
 MAX_LAG_STD_S = 0.05  # of a lag that is determined
 MIN_COST_CONTRAST = 1.15  # median over smallest misfit, of a lag that is determined
@@ -144,7 +144,7 @@ class _CloudFollower:
         self.clouds = []
         for i in frames:
             cloud = clouds.xyz[ends[i] - clouds.counts[i] : ends[i]]
-            self.clouds.append(cloud[:: max(1, len(cloud) // MAX_POINTS_PER_FRAME)])
+            self.clouds.append(cloud[:: max(1, len(cloud) // MAX_LAG_POINTS_PER_FRAME)])
 
     def misfit(self, covered: np.ndarray, position: np.ndarray, rotation: np.ndarray) -> np.ndarray:
         """Return [C] m, the misfit of the nearest points in the covered frames."""

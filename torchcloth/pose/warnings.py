@@ -13,7 +13,7 @@ from .fine_scale_uncertainty import FINE_SCALE_SETTINGS
 
 MAX_FORCE_FRACTION = 0.1  # of the weight; a larger corrective force says that the model is wrong
 MAX_POINT_NOISE_RATIO = 1.3  # rms residual over the stated noise
-MAX_GAP_S = 0.3  # duration without any data
+MAX_UNOBSERVED_GAP_S = 0.3  # duration without any data
 
 
 def pose_warnings(
@@ -66,7 +66,7 @@ def pose_warnings(
     for wrench in episode.wrenches.values():
         has_force |= wrench.isfinite().any(-1)
     gap = _longest_gap(episode.times, seen.any(1) | has_force)
-    if gap > MAX_GAP_S:
+    if gap > MAX_UNOBSERVED_GAP_S:
         warnings.append(f"there are no data for {gap:.2f} s: there the estimate is simulation alone")
     return warnings + episode.data_warnings()
 

@@ -12,12 +12,15 @@ from ..materials import AEP, AbstractMaterial, OrthotropicAEP
 from ..materials.presets import NOMINAL_THICKNESS_M, find_fabric
 from ..meshes import Mesh
 
-SHEET_SIDE_M = 0.5
+SYNTHETIC_SHEET_SIDE_M = 0.5
 DEFAULT_AREAL_DENSITY_KG_PER_M2 = 0.2  # if the fabric's source gives none
 DEFAULT_BENDING_STIFFNESS_NM = 1e-5  # likewise; that of a light cotton
 BENDING_DAMPING_TIME_S = 0.03
 NOMINAL_STIFFNESS_FACTOR = 1.5  # nominal over true membrane stiffness, so that a fit has something to find
-CONTACT_STIFFNESS_N_PER_M, SHEAR_STIFFNESS_N_PER_M = 60.0, 20.0  # k h and gamma h; published ones need tiny substeps
+GARMENT_CONTACT_STIFFNESS_N_PER_M, SHEAR_STIFFNESS_N_PER_M = (
+    60.0,
+    20.0,
+)  # k h and gamma h; published ones need tiny substeps
 
 
 class Garment(NamedTuple):
@@ -38,9 +41,9 @@ class Garment(NamedTuple):
 
 def _sheet(triangles: int) -> Mesh:
     """Return a square mesh with its upper corners as places."""
-    flat = meshes.rectangle(SHEET_SIDE_M, SHEET_SIDE_M, triangles=triangles)
-    shifted = flat.vertices - [SHEET_SIDE_M / 2, SHEET_SIDE_M, 0.0]
-    at_side = np.abs(shifted[:, 0]) > SHEET_SIDE_M / 2 - 1e-9
+    flat = meshes.rectangle(SYNTHETIC_SHEET_SIDE_M, SYNTHETIC_SHEET_SIDE_M, triangles=triangles)
+    shifted = flat.vertices - [SYNTHETIC_SHEET_SIDE_M / 2, SYNTHETIC_SHEET_SIDE_M, 0.0]
+    at_side = np.abs(shifted[:, 0]) > SYNTHETIC_SHEET_SIDE_M / 2 - 1e-9
     top = at_side & (shifted[:, 1] > -1e-9)
     places = {"left corner": np.flatnonzero(top & (shifted[:, 0] < 0))}
     places["right corner"] = np.flatnonzero(top & (shifted[:, 0] > 0))
@@ -104,4 +107,7 @@ def nominal_properties(fabric: str) -> dict[str, float]:
 
 def _with_soft_contact(values: dict[str, Any]) -> dict[str, Any]:
     h = values["thickness"]
-    return values | {"contact_stiffness": CONTACT_STIFFNESS_N_PER_M / h, "shear_stiffness": SHEAR_STIFFNESS_N_PER_M / h}
+    return values | {
+        "contact_stiffness": GARMENT_CONTACT_STIFFNESS_N_PER_M / h,
+        "shear_stiffness": SHEAR_STIFFNESS_N_PER_M / h,
+    }

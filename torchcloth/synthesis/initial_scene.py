@@ -22,7 +22,7 @@ from .garments import BENDING_DAMPING_TIME_S, GARMENTS, Garment, build_garment_m
 
 ARM_OF_GRIP = ("right", "left")  # arms at -y and +y, which take a garment's first and second grip
 INITIAL_LAYER_DISTANCE_M = 1e-3  # between front and back
-LAYER_GAP_M = 0.012  # between layers that touch
+GARMENT_LAYER_GAP_M = 0.012  # between layers that touch
 GRIP_RADIUS_M = 0.026  # of the gripped cloth: a finger pad of 15 x 38 mm across its diagonal
 TOOL_HEIGHT_M = 0.015  # of the tool's centre above gripped cloth on the table, because fingers have a thickness
 TABLE_FRICTION = 0.4
@@ -96,7 +96,7 @@ def _cloth(spec: EpisodeSpec, mesh: Mesh, gripped_vertices: dict[str, np.ndarray
             "bending": Bending(values["bending_stiffness"], damping_time=BENDING_DAMPING_TIME_S),
         },
         {**grasps, "table": Plane(friction=TABLE_FRICTION, offset=INITIAL_LAYER_DISTANCE_M / 2)},
-        Contact.with_gap(LAYER_GAP_M),
+        Contact.with_gap(GARMENT_LAYER_GAP_M),
     )
 
 

@@ -50,7 +50,7 @@ class AblationStudy(ResumableStudy):
         return self.folder / "runs" / f"{'-'.join(scene)}-{variant.name}.npz"
 
     def has_run(self, scene: SceneName, variant: Variant) -> bool:
-        """Whether a run is finished."""
+        """Tell whether a run is finished."""
         return self.path(scene, variant).exists()
 
     def save_run(self, scene: SceneName, variant: Variant, run: Run) -> None:

@@ -44,7 +44,7 @@ LEVELS = (25, 50, 75, 125, 150, 175)  # % of the reference
 PARAMETERS = {"E": "youngs_modulus", "nu": "poisson_ratio", "k": "contact_stiffness", "gamma": "shear_stiffness"}
 ACTIONS = ("fling", "drag", "cover")
 PERTURBATION_STD_M = 1e-6  # of each coordinate of the start in the perturbed run
-FRAME_PERIOD_S = 0.05
+ABLATION_FRAME_PERIOD_S = 0.05
 ASSUMPTIONS = "the paths, air (C_n 1.2), bending (1e-5 N m), table friction 0.4, c_F 0.3"
 NEGLIGIBLE_FACTOR = 1e-9  # removes a stiffness
 
@@ -215,7 +215,7 @@ class Scene:
 
     def frame_times(self) -> list[float]:
         """Return the times [s] of the stored frames."""
-        count = max(1, round(self.action.duration / FRAME_PERIOD_S))
+        count = max(1, round(self.action.duration / ABLATION_FRAME_PERIOD_S))
         return np.linspace(0, self.action.duration, count + 1).tolist()
 
     @torch.no_grad()

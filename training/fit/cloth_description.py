@@ -60,7 +60,7 @@ def build_described_cloth(description: dict[str, Any], model: Model) -> Cloth:
 
 
 def same_cloth(first: dict[str, Any], other: dict[str, Any]) -> bool:
-    """Whether two descriptions give the same model, except for start values and the density's error."""
+    """Tell whether two descriptions give the same model, except for start values and the density's error."""
     ignored = {"nominal", "areal_density_std"}
     first, second = ({**d, "cloth": {k: v for k, v in d["cloth"].items() if k not in ignored}} for d in (first, other))
     return _equal(first, second)

@@ -42,7 +42,7 @@ from .measured import DATA_VARIABLE, find_data_folder, swings
 from .resumable_diagnosis import diagnosis_in
 
 SWING_RUNS = ("range60_rep1", "range90_rep1", "range30_rep1", "range60_rep2")
-EPISODE_S, FAST_EPISODE_S = 6.0, 4.0
+EPISODE_S, FAST_INJECTION_EPISODE_S = 6.0, 4.0
 CAMERA_DISTANCE_M = 1.3  # assumed, because the data do not contain it; depths are scaled from there
 BASE_CAUSE = "air.linear"  # named first by a diagnosis of the unchanged swings
 HYPOTHESIS_PREFIXES = ("obs.", "env.gravity_tilt")  # of the tested hypotheses
@@ -185,7 +185,7 @@ def _find_hypothesis(hypotheses: Sequence[Hypothesis], name: str) -> Hypothesis:
 def _crop_start(r: Recording, fast: bool) -> Recording:
     """Return the beginning of a recording, with a camera in front of the cloth."""
     points = r.require("points", by="the study")
-    points = points.select(points.t - points.t[0] <= (FAST_EPISODE_S if fast else EPISODE_S))
+    points = points.select(points.t - points.t[0] <= (FAST_INJECTION_EPISODE_S if fast else EPISODE_S))
     pose = np.eye(4)
     pose[:3, 3] = points.xyz.mean(0) - [0.0, CAMERA_DISTANCE_M, 0.0]
     camera = Camera(width=640, height=480, K=np.eye(3), T_world_camera=pose)
@@ -201,7 +201,7 @@ def _inject(r: Recording, fault: Fault) -> Recording:
 
 
 def show(result: dict[str, Any]) -> None:
-    """Print the tables."""
+    """Print the tables of the study."""
     from rich.console import Console
     from rich.markup import escape
 

@@ -60,7 +60,7 @@ class Target(NamedTuple):
 
     @property
     def number(self) -> float | None:
-        """Point estimate."""
+        """Point estimate of the figure."""
         return self.value.share if isinstance(self.value, Rate) else self.value
 
     @property

@@ -61,7 +61,7 @@ class NamedCause(NamedTuple):
 
     @property
     def stands_alone(self) -> bool:
-        """Whether the answer says that nothing else is possible."""
+        """Tell whether the answer says that nothing else is possible."""
         return len(self.candidates) == 1
 
 
@@ -130,7 +130,7 @@ def score_case(truth: Truth, answer: Answer) -> dict[str, Any]:
 
 
 def observable_effects(truth: Truth, sizes: Sequence[Mapping[str, Any]] | None) -> list[bool] | None:
-    """Whether each effect changes the recording by more than a change of the fabric's parameters could explain.
+    """Tell whether each effect changes the recording by more than a change of the fabric's parameters could explain.
 
     Effects that only enable another one are left out.
 
@@ -171,7 +171,7 @@ def match_causes(causes: Sequence[NamedCause], expected: Sequence[ExpectedEffect
 
 
 def _is_unresolvable(answer: Answer, w: ExpectedEffect) -> bool:
-    """Whether the answer says that these data do not show the effect."""
+    """Tell whether the answer says that these data do not show the effect."""
     return any(effect(row["effect"]) in w.names for row in answer.get("unresolvable", ()))
 
 
@@ -211,7 +211,7 @@ def _is_right(
 
 
 def is_unexplained(answer: Answer) -> bool:
-    """Whether the answer says that a lack of fit remains which no known cause explains."""
+    """Tell whether the answer says that a lack of fit remains which no known cause explains."""
     return answer.get("verdict") == "unexplained" or bool(answer.get("also_unexplained"))
 
 
@@ -220,7 +220,7 @@ def _are_all_among(causes: Sequence[NamedCause], names: Sequence[str]) -> bool:
 
 
 def is_answered_as_confounded(truth: Truth, answer: Answer, causes: Sequence[NamedCause]) -> bool:
-    """Whether a confounded case is answered as such.
+    """Tell whether a confounded case is answered as such.
 
     Either the effect is named together with another candidate, and no false cause stands alone. Or nothing is named,
     and the effect is listed among those that these data cannot decide. If the data may separate the two after all, the
@@ -240,7 +240,7 @@ def is_answered_as_confounded(truth: Truth, answer: Answer, causes: Sequence[Nam
 
 
 def is_resolved(truth: Truth, answer: Answer) -> bool:
-    """Whether the effect stands alone, and no false cause does."""
+    """Tell whether the effect stands alone, and no false cause does."""
     names, causes = frozenset(n for w in list_expected_effects(truth) for n in w.names), list_named_causes(answer)
     false = any(c.stands_alone and c.name not in true_names(truth) for c in causes)
     return not false and any(c.stands_alone and c.name in names for c in causes)

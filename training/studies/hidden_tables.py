@@ -69,8 +69,10 @@ def rounds_csv(rounds: Mapping[str, Sequence[Mapping[str, Any]]]) -> str:
 
 def tabulate_effects(cases: Sequence[Mapping[str, Any]]) -> str:
     """Return Markdown with the rates of each single effect."""
-    count = lambda r: f"{r.hits} of {r.of}" if r.of else NO_VALUE  # noqa: E731
-    rows = [(name, *map(count, rates)) for name, rates in hidden_rates.by_effect(cases).items()]
+    rows = [
+        (name, *(f"{r.hits} of {r.of}" if r.of else NO_VALUE for r in rates))
+        for name, rates in hidden_rates.by_effect(cases).items()
+    ]
     return _markdown_table(
         ("one effect, class identified", "half its typical size", "typical", "1.5", "of all that show"), rows
     )

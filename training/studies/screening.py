@@ -36,7 +36,7 @@ from .screening_ablations import ABLATIONS, with_fixed_parameters, with_tangent_
 
 NULL_SEEDS = (40, 42, 43, 44, 45)  # a null and four hard ones
 SINGLE_CAUSE_SEEDS = (6, 567)  # half of a drag, and wind
-TRUTH_NODES = 19  # along each side of the true sheet, two thirds of those in a hidden round
+SCREENING_TRUTH_NODES = 19  # along each side of the true sheet, two thirds of those in a hidden round
 ALL_PARTS = "with all parts"
 
 
@@ -61,7 +61,7 @@ def run(options: argparse.Namespace) -> None:
 def screen_case(out: Path, seed: int, fast: bool) -> dict[str, Any]:
     """Screen a case in each way; return also what is hidden in it."""
     episodes = out / "episodes" / str(seed)
-    how = ["--fast"] if fast else ["--nodes", str(TRUTH_NODES)]
+    how = ["--fast"] if fast else ["--nodes", str(SCREENING_TRUTH_NODES)]
     if make_case.main(["--seed", str(seed), "--out", str(episodes), *how]):
         raise InvalidInput("studies screening", got=f"case {seed} that could not be made", expected="its episodes")
     episode_folders = sorted(

@@ -71,7 +71,7 @@ class Scale:
 
     @property
     def coarse(self) -> Discretisation:
-        """Discretisation for planning."""
+        """Discretisation that is used for planning."""
         return Discretisation(self.triangles, self.gap)
 
     @property

@@ -12,12 +12,12 @@ from .cloud_overlays import CloudOverlay
 from .figure_layout import grid_shape, hide_unused_axes
 
 SHOWN_QUANTILE = 0.98  # of the distances at the end of the colour bar
-MIN_COLOUR_LIMIT_MM = 1.0  # a shorter colour bar would dramatise noise
+MIN_OVERLAY_COLOUR_LIMIT_MM = 1.0  # a shorter colour bar would dramatise noise
 MAX_DRAWN_POINTS = 2000  # of one panel
 VIEW_AZIMUTH_DEG = 50.0  # of the eye from the cloth's normal
 VIEW_ELEVATION_DEG = 18.0  # of the eye over the horizon
 MODEL_TITLES = ("base model", "with causes")
-MAX_TITLE_LETTERS = 30  # of a line of a title
+MAX_PANEL_TITLE_LETTERS = 30  # of a line of a title
 
 
 def draw_cloud_overlays(overlays: Sequence[CloudOverlay], faces: np.ndarray) -> Any:
@@ -35,7 +35,7 @@ def draw_cloud_overlays(overlays: Sequence[CloudOverlay], faces: np.ndarray) -> 
     rows, count = len(overlays[0].surfaces), len(overlays)
     columns, lines = grid_shape(count)
     distances = np.concatenate([o.distances[0].numpy() for o in overlays])
-    limit = max(1e3 * float(np.quantile(distances, SHOWN_QUANTILE)), MIN_COLOUR_LIMIT_MM)
+    limit = max(1e3 * float(np.quantile(distances, SHOWN_QUANTILE)), MIN_OVERLAY_COLOUR_LIMIT_MM)
     figure = Figure(figsize=(2.9 * columns + 1.4, (2.8 * rows + 0.3) * lines), layout="constrained")
     axes = figure.subplots(rows * lines, columns, squeeze=False, subplot_kw={"projection": "3d"})
     for k, o in enumerate(overlays):
@@ -43,7 +43,7 @@ def draw_cloud_overlays(overlays: Sequence[CloudOverlay], faces: np.ndarray) -> 
         for axis, x, distance, title in zip(column, o.surfaces, o.distances, MODEL_TITLES, strict=False):
             image = _draw_overlay(axis, o, x.numpy(), 1e3 * distance.numpy(), faces, limit)
             axis.set_title(f"{title}: {1e3 * float(distance.mean()):.1f} mm", fontsize=8)
-        label = textwrap.fill(f"{o.motion}, {o.time:.2f} s", MAX_TITLE_LETTERS)
+        label = textwrap.fill(f"{o.motion}, {o.time:.2f} s", MAX_PANEL_TITLE_LETTERS)
         column[0].set_title(f"{label}\n{column[0].get_title()}", fontsize=8, parse_math=False)
     hide_unused_axes(axes, count, rows)
     figure.colorbar(image, ax=axes, label="point to surface, mm", shrink=0.8)  # pyright: ignore[reportPossiblyUnbound]

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from typing import Any
 
-MAX_COLUMNS = 3  # panels beside each other that can be read
+MAX_FIGURE_COLUMNS = 3  # panels beside each other that can be read
 FULL_ROW = 4  # this many panels fill one row, rather than leave one alone in a second row
 
 
 def grid_shape(count: int) -> tuple[int, int]:
     """Return (columns, rows) of a grid for so many panels."""
-    columns = count if count == FULL_ROW else min(count, MAX_COLUMNS)
+    columns = count if count == FULL_ROW else min(count, MAX_FIGURE_COLUMNS)
     return columns, -(-count // columns)
 
 

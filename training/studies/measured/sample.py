@@ -19,12 +19,12 @@ from ...validation.realdata import diffcp_sample
 
 SOURCE_NAME = "diffcp_sample"
 FITTED_NAMES = ["youngs_modulus"]
-FIT_ITERATIONS = 3
+SAMPLE_FIT_ITERATIONS = 3
 CLOUD_COUNT = {True: 3, False: None}  # by ``fast``
 
 
 def recording(source: Path, fast: bool) -> Recording:
-    """Return the episode."""
+    """Read the episode of the sample, with all clouds or a few."""
     return diffcp_sample.read_recording(source, count=CLOUD_COUNT[fast])
 
 
@@ -33,7 +33,9 @@ def run(source: Path, out: Path, journal: Path, fast: bool) -> dict[str, Any]:
     given = recording(source, fast)
     cloth = build_cloth(given)
     resume = (journal / "problem").exists()
-    fit = identify(cloth, given, FITTED_NAMES, iterations=1 if fast else FIT_ITERATIONS, journal=journal, resume=resume)
+    fit = identify(
+        cloth, given, FITTED_NAMES, iterations=1 if fast else SAMPLE_FIT_ITERATIONS, journal=journal, resume=resume
+    )
     fit.save(out)
     data, faces = build_episode(cloth, given), torch.as_tensor(cloth.mesh.faces)
     still = data.initial.expand(len(data.times), -1, -1)
@@ -60,9 +62,9 @@ def distances(frames: Tensor, clouds: list[Tensor], faces: Tensor) -> dict[str, 
     to_surface = [float(chamfer_to_surface(cloud, x, faces)) for cloud, x in pairs]
     to_vertices = [float(chamfer_to_vertices(cloud, x)) for cloud, x in pairs]
     from_vertices = [float(chamfer_to_vertices(x, cloud)) for cloud, x in pairs]
-    mean = lambda numbers: sum(numbers) / len(numbers)  # noqa: E731
-    return {
-        "cloud to surface": mean(to_surface),
-        "cloud to vertices": mean(to_vertices),
-        "vertices to cloud": mean(from_vertices),
+    distances = {
+        "cloud to surface": to_surface,
+        "cloud to vertices": to_vertices,
+        "vertices to cloud": from_vertices,
     }
+    return {name: sum(values) / len(values) for name, values in distances.items()}
