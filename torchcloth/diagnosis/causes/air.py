@@ -5,7 +5,7 @@ from __future__ import annotations
 from functools import partial
 
 from ..._utils.constants import STANDARD_AIR_DENSITY_KG_PER_M3
-from ...effects import AbstractEffect, AddedMass, AirDrag, BendingFriction, KelvinVoigt, MassDamping, ShearFriction
+from ...effects import AddedMass, AirDrag, BendingFriction, KelvinVoigt, MassDamping, ShearFriction
 from ...episodes.world import Hypothesis, World
 
 DRAG_EFFECT_NAME = "air"
@@ -33,10 +33,6 @@ def _add_wind(axis: int, world: World, speed: float) -> World:
     return world.with_cloth({DRAG_EFFECT_NAME: AirDrag(normal, density, t, wind)})
 
 
-def _add_effect(name: str, make: type[AbstractEffect], world: World, amplitude: float) -> World:
-    return world.with_cloth({name: make(amplitude)})  # type: ignore[call-arg]
-
-
 def _add_viscosity(world: World, time: float) -> World:
     material = world.cloth.material
     stiffness = float(material.youngs_modulus.value) * float(material.thickness)  # type: ignore[union-attr,arg-type]
@@ -44,13 +40,27 @@ def _add_viscosity(world: World, time: float) -> World:
 
 
 HYPOTHESES = (
-    Hypothesis("air.drag_n", "-", 1.2, lambda w, a: _add_drag(w, normal=a)),
-    Hypothesis("air.drag_t", "-", 0.016, lambda w, a: _add_drag(w, tangential=a)),
-    Hypothesis("air.linear", "1/s", 2.0, partial(_add_effect, "linear", MassDamping)),
-    Hypothesis("air.added_mass", "m", 0.15, partial(_add_effect, "added_mass", AddedMass)),
-    Hypothesis("air.wind[x]", "m/s", 0.3, partial(_add_wind, 0), signed=True, implies="air.drag_n"),
-    Hypothesis("air.wind[y]", "m/s", 0.3, partial(_add_wind, 1), signed=True, implies="air.drag_n"),
-    Hypothesis("damp.kv", "s", 5e-3, _add_viscosity),
-    Hypothesis("fric.internal_bend", "N", 3e-4, partial(_add_effect, "bending_friction", BendingFriction)),
-    Hypothesis("fric.internal_shear", "N/m", 1.0, partial(_add_effect, "shear_friction", ShearFriction)),
+    Hypothesis.from_amplitude(AirDrag, "normal", lambda w, a: _add_drag(w, normal=a), effect_name=DRAG_EFFECT_NAME),
+    Hypothesis.from_amplitude(
+        AirDrag, "tangential", lambda w, a: _add_drag(w, tangential=a), effect_name=DRAG_EFFECT_NAME
+    ),
+    Hypothesis.from_amplitude(MassDamping),
+    Hypothesis.from_amplitude(AddedMass),
+    *(
+        Hypothesis.from_amplitude(
+            AirDrag, "wind", partial(_add_wind, k), axis=axis, effect_name=DRAG_EFFECT_NAME, implies="air.drag_n"
+        )
+        for k, axis in enumerate("xy")
+    ),
+    Hypothesis(
+        "damp.kv",
+        "s",
+        5e-3,
+        _add_viscosity,
+        title="Viscosity in tension (Kelvin-Voigt)",
+        description="Stretching is damped: stress grows with the rate of strain.",
+        effect_names=("viscosity",),
+    ),
+    Hypothesis.from_amplitude(BendingFriction, effect_name="bending_friction"),
+    Hypothesis.from_amplitude(ShearFriction, effect_name="shear_friction"),
 )

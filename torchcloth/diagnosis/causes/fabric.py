@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 from ...effects import Bending, CreasingBending, Gravity, LineMass, RestShape
 from ...episodes.world import Hypothesis, World
 from ...errors import InvalidInput
@@ -63,7 +65,11 @@ def _change_bending(world: World, **changes: float) -> World:
     return world.with_cloth({"bending": new})
 
 
-def _change_rest_shape(world: World, name: str, amount: float) -> World:
+def _add_curl(axis: str, world: World, curvature: float) -> World:
+    return _change_bending(world, **{f"curl_{axis}": curvature})
+
+
+def _change_rest_shape(name: str, world: World, amount: float) -> World:
     effects = dict(world.cloth.effects.items())
     rest_shape: RestShape | None = effects.get("rest_shape")  # type: ignore[assignment]
     values = {
@@ -98,11 +104,20 @@ def _tilt_gravity(axis: int, world: World, angle: float) -> World:
     return world.with_cloth({"gravity": Gravity(gravity.acceleration.tolist(), tilt)})
 
 
+PATTERN_AXES = ("warp", "weft")
 BENDING_EFFECTS = ("damp.bend", "plast.crease", "bend.aniso", "rest.curl")  # change a cloth's bending
 MEMBRANE_EFFECTS = ("elas.ortho", "elas.shear", "damp.kv", "fric.internal_shear")  # change its stretching
 HYPOTHESES = (
-    Hypothesis("damp.bend", "s", 0.05, lambda w, a: _change_bending(w, damping_time=a)),
-    Hypothesis("plast.crease", "1/s", 5.0, lambda w, a: _change_bending(w, mobility=a), needs_fine_mesh=True),
+    Hypothesis.from_amplitude(
+        Bending, "damping_time", lambda w, a: _change_bending(w, damping_time=a), effect_name="bending"
+    ),
+    Hypothesis.from_amplitude(
+        CreasingBending,
+        "mobility",
+        lambda w, a: _change_bending(w, mobility=a),
+        effect_name="bending",
+        needs_fine_mesh=True,
+    ),
     Hypothesis(
         "bend.aniso",
         "-",
@@ -110,9 +125,19 @@ HYPOTHESES = (
         lambda w, a: _change_bending(w, weft=a),
         signed=True,
         min_amplitude=-MAX_STIFFNESS_DEFICIT,
+        title="Anisotropy of bending",
+        description="The cloth bends more easily, or less, along the weft than along the warp.",
+        effect_names=("bending",),
     ),
     Hypothesis(
-        "elas.ortho", "-", 0.5, lambda w, a: change_moduli(w, weft=a), signed=True, max_amplitude=MAX_STIFFNESS_DEFICIT
+        "elas.ortho",
+        "-",
+        0.5,
+        lambda w, a: change_moduli(w, weft=a),
+        signed=True,
+        max_amplitude=MAX_STIFFNESS_DEFICIT,
+        title="Orthotropy in tension",
+        description="The cloth stretches more along the weft than along the warp.",
     ),
     Hypothesis(
         "elas.shear",
@@ -121,18 +146,59 @@ HYPOTHESES = (
         lambda w, a: change_moduli(w, shear=a),
         signed=True,
         min_amplitude=-MAX_STIFFNESS_DEFICIT,
+        title="Shear stiffness",
+        description="The cloth shears more easily, or less, than an isotropic sheet.",
     ),
     Hypothesis(
-        "elas.stiffen", "-", 10.0, lambda w, a: change_moduli(w, stiffening=a), equivalent_parameter="stiffening"
+        "elas.stiffen",
+        "-",
+        10.0,
+        lambda w, a: change_moduli(w, stiffening=a),
+        equivalent_parameter="stiffening",
+        title="Stiffening in tension",
+        description="The cloth becomes stiffer the more it is stretched.",
     ),
-    Hypothesis("rest.curl[warp]", "1/m", 3.0, lambda w, a: _change_bending(w, curl_warp=a), signed=True),
-    Hypothesis("rest.curl[weft]", "1/m", 3.0, lambda w, a: _change_bending(w, curl_weft=a), signed=True),
-    Hypothesis("rest.shrink[warp]", "-", 0.03, lambda w, a: _change_rest_shape(w, "shrink_warp", a), signed=True),
-    Hypothesis("rest.shrink[weft]", "-", 0.03, lambda w, a: _change_rest_shape(w, "shrink_weft", a), signed=True),
-    Hypothesis("rest.skew", "rad", 0.03, lambda w, a: _change_rest_shape(w, "skew", a), signed=True),
-    Hypothesis("mass.density", "-", 0.08, _change_density, signed=True, equivalent_parameter="areal_density"),
-    Hypothesis("mass.hem", "kg/m", 0.02, lambda w, a: w.with_cloth({"hem": LineMass(a)})),
-    Hypothesis("mass.seam", "kg/m", 0.02, _add_seam),
-    Hypothesis("env.gravity_tilt[x]", "rad", 0.01, lambda w, a: _tilt_gravity(0, w, a), signed=True),
-    Hypothesis("env.gravity_tilt[y]", "rad", 0.01, lambda w, a: _tilt_gravity(1, w, a), signed=True),
+    *(
+        Hypothesis.from_amplitude(
+            Bending,
+            f"curl_{axis}",
+            partial(_add_curl, axis),
+            axis=axis,
+            effect_name="bending",
+        )
+        for axis in PATTERN_AXES
+    ),
+    *(
+        Hypothesis.from_amplitude(
+            RestShape,
+            f"shrink_{axis}",
+            partial(_change_rest_shape, f"shrink_{axis}"),
+            axis=axis,
+            effect_name="rest_shape",
+        )
+        for axis in PATTERN_AXES
+    ),
+    Hypothesis.from_amplitude(RestShape, "skew", partial(_change_rest_shape, "skew"), effect_name="rest_shape"),
+    Hypothesis(
+        "mass.density",
+        "-",
+        0.08,
+        _change_density,
+        signed=True,
+        equivalent_parameter="areal_density",
+        title="Areal density",
+        description="The cloth is heavier, or lighter, than its data sheet says.",
+    ),
+    Hypothesis.from_amplitude(LineMass),
+    Hypothesis.from_amplitude(
+        LineMass,
+        apply=_add_seam,
+        name="mass.seam",
+        title="Mass of a seam",
+        description="A heavy line runs along the middle of the cloth.",
+    ),
+    *(
+        Hypothesis.from_amplitude(Gravity, "tilt", partial(_tilt_gravity, k), axis=axis, effect_name="gravity")
+        for k, axis in enumerate("xy")
+    ),
 )

@@ -92,8 +92,16 @@ def _has_table(recording: Recording) -> bool:
 
 
 HYPOTHESES = (
-    Hypothesis("grip.slip", "m/(N s)", 0.05, _add_slip),
-    Hypothesis("grip.width", "m", 0.02, lambda w, a: move_grip_patches(w, wider=a), max_amplitude=0.05),
+    Hypothesis.from_amplitude(GripSlip, "mobility", _add_slip, effect_name="slip_*"),
+    Hypothesis(
+        "grip.width",
+        "m",
+        0.02,
+        lambda w, a: move_grip_patches(w, wider=a),
+        max_amplitude=0.05,
+        title="Width of the grip",
+        description="The grippers hold a larger patch than stated.",
+    ),
     Hypothesis(
         "robot.regrasp",
         "m",
@@ -102,8 +110,19 @@ HYPOTHESES = (
         signed=True,
         min_amplitude=-0.04,
         max_amplitude=0.04,
+        title="Place of the grip",
+        description="The grippers hold the cloth elsewhere along its edge than stated.",
     ),
-    Hypothesis("contact.mu", "-", 0.2, lambda w, a: _change_friction(w, more=a), signed=True, is_applicable=_has_table),
+    Hypothesis(
+        "contact.mu",
+        "-",
+        0.2,
+        lambda w, a: _change_friction(w, more=a),
+        signed=True,
+        is_applicable=_has_table,
+        title="Friction (mu)",
+        description="Friction on the table is stronger, or weaker, than stated.",
+    ),
     Hypothesis(
         "contact.aniso",
         "-",
@@ -112,7 +131,17 @@ HYPOTHESES = (
         signed=True,
         is_applicable=_has_table,
         min_amplitude=-0.9,
+        title="Anisotropy of friction",
+        description="Friction on the table depends on the direction of sliding.",
     ),
-    Hypothesis("contact.stick", "-", 0.3, lambda w, a: _change_friction(w, excess=a), is_applicable=_has_table),
-    Hypothesis("contact.adhesion", "Pa", 1.5, _add_adhesion, is_applicable=_has_table),
+    Hypothesis(
+        "contact.stick",
+        "-",
+        0.3,
+        lambda w, a: _change_friction(w, excess=a),
+        is_applicable=_has_table,
+        title="Static friction",
+        description="Friction on the table is stronger before the cloth slips than while it does.",
+    ),
+    Hypothesis.from_amplitude(Adhesion, "stress", _add_adhesion, effect_name="*_pull", is_applicable=_has_table),
 )

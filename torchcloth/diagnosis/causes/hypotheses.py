@@ -10,19 +10,19 @@ import math
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
+from fnmatch import fnmatchcase
 
 from ...episodes.world import RESIDUAL_EFFECT_PREFIX, Hypothesis, WorldModel
 from ...errors import InvalidInput
 from ...pose.objective import CORRECTION_EFFECT_NAME
 from ...recordings import Recording
-from . import air, fabric, grip, observer
+from . import fabric, grip
+from .catalogue import CATALOGUE
 from .user_hypothesis_checks import explaining_user_errors
 
 RESERVED_EFFECT_NAMES = frozenset(
-    {air.DRAG_EFFECT_NAME, "linear", "added_mass", "viscosity", "hem", "seam", "rest_shape", "gravity", "bending"}
-    | {"bending_friction", "shear_friction", RESIDUAL_EFFECT_PREFIX, CORRECTION_EFFECT_NAME}
-)
-RESERVED_PREFIX, RESERVED_SUFFIX = "slip_", "_pull"  # of effects named after a gripper or a table
+    {name for h in CATALOGUE for name in h.effect_names} | {RESIDUAL_EFFECT_PREFIX, CORRECTION_EFFECT_NAME}
+)  # patterns: an effect that belongs to one gripper or table has "*" in the place of its name
 _registered: list[Hypothesis] = []
 _recorders: list[list[Hypothesis]] = []
 
@@ -54,10 +54,9 @@ def _check_fields(hypothesis: Hypothesis) -> None:
     for key in ("name", "unit"):
         if not isinstance(text := getattr(hypothesis, key), str) or not text:
             raise InvalidInput(f"{key} of a hypothesis", got=repr(text), expected="a word")
-    if not isinstance(hypothesis.description, str):
-        raise InvalidInput(
-            f"description of {hypothesis.name!r}", got=repr(hypothesis.description), expected="a sentence"
-        )
+    for key in ("title", "description"):
+        if not isinstance(text := getattr(hypothesis, key), str):
+            raise InvalidInput(f"{key} of {hypothesis.name!r}", got=repr(text), expected="a sentence")
     for key in ("typical", "smallest_fraction", "step_fraction", "min_amplitude", "max_amplitude"):
         if not isinstance(number := getattr(hypothesis, key), (int, float)):
             raise InvalidInput(f"{key} of {hypothesis.name!r}", got=repr(number), expected="a number")
@@ -111,7 +110,7 @@ def record_registrations() -> Iterator[list[Hypothesis]]:
 
 def list_known_hypotheses() -> list[Hypothesis]:
     """Return all hypotheses of the catalogue, then those that users registered."""
-    return [*air.HYPOTHESES, *fabric.HYPOTHESES, *grip.HYPOTHESES, *observer.HYPOTHESES, *_registered]
+    return [*CATALOGUE, *_registered]
 
 
 def list_hypotheses(model: WorldModel, recordings: Sequence[Recording]) -> list[Hypothesis]:
@@ -133,8 +132,7 @@ def list_hypotheses(model: WorldModel, recordings: Sequence[Recording]) -> list[
 def _check_effect_names(hypothesis: Hypothesis, model: WorldModel) -> None:
     """Raise InvalidInput for a name of the catalogue: the later effect would silently replace the earlier one."""
     for name, effect in hypothesis.apply_to(model.base, hypothesis.typical).cloth.effects.items():
-        is_reserved = name in RESERVED_EFFECT_NAMES
-        is_reserved = is_reserved or name.startswith(RESERVED_PREFIX) or name.endswith(RESERVED_SUFFIX)
+        is_reserved = any(fnmatchcase(name, pattern) for pattern in RESERVED_EFFECT_NAMES)
         if is_reserved and not type(effect).__module__.startswith("torchcloth."):
             got = f"an effect {type(effect).__name__} named {name!r}, as the catalogue calls one of its own"
             raise InvalidInput(f"hypothesis {hypothesis.name!r}", got=got, expected="another name")

@@ -53,15 +53,42 @@ HYPOTHESES = (
             partial(_shift_observer, _CAMERA, k, 6),
             signed=True,
             structurally_equivalent=("robot.base",),
+            title="Camera offset",
+            description="The cloud lies so much too far along x, y or z of the world: "
+            "T_world_camera is off by as much.",
         )
         for k, axis in enumerate(AXES)
     ),
     *(
-        Hypothesis(f"obs.rotation[{axis}]", "rad", 0.02, partial(_shift_observer, _CAMERA, 3 + k, 6), signed=True)
+        Hypothesis(
+            f"obs.rotation[{axis}]",
+            "rad",
+            0.02,
+            partial(_shift_observer, _CAMERA, 3 + k, 6),
+            signed=True,
+            title="Camera rotation",
+            description="The cloud is turned about x, y or z of the world, around the cloth, by the right hand.",
+        )
         for k, axis in enumerate(AXES)
     ),
-    Hypothesis("obs.clock", "s", 0.03, partial(_shift_observer, _CLOCK, 0, 1), signed=True),
-    Hypothesis("obs.edge", "m", 8e-3, partial(_shift_observer, _RIM, 0, 1), signed=True),
+    Hypothesis(
+        "obs.clock",
+        "s",
+        0.03,
+        partial(_shift_observer, _CLOCK, 0, 1),
+        signed=True,
+        title="Clock offset",
+        description="Frames were taken later than their stamps say, or earlier where negative.",
+    ),
+    Hypothesis(
+        "obs.edge",
+        "m",
+        8e-3,
+        partial(_shift_observer, _RIM, 0, 1),
+        signed=True,
+        title="Offset of the rim",
+        description="The cloud's rim lies farther out than the cloth's: flying pixels, or erosion where negative.",
+    ),
     Hypothesis(
         "obs.depth_scale",
         "-",
@@ -69,6 +96,8 @@ HYPOTHESES = (
         lambda w, a: _change_depth(w, fraction=a),
         signed=True,
         is_applicable=_has_depth_camera,
+        title="Scale of depth",
+        description="The camera's depths are too large by a share.",
     ),
     Hypothesis(
         "obs.depth_bias",
@@ -77,5 +106,7 @@ HYPOTHESES = (
         lambda w, a: _change_depth(w, offset=a),
         signed=True,
         is_applicable=_has_depth_camera,
+        title="Offset of depth",
+        description="The camera's depths are too large by a constant.",
     ),
 )

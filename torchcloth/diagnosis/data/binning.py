@@ -15,7 +15,7 @@ from torch import Tensor
 from ...episodes.observed import Episode
 from ...episodes.observed_surface import ERROR_GROUPS_PER_AXIS, ObservedSurface
 from ...episodes.replay import Frames
-from ...identification.residuals.blocks import BLOCKS
+from ...identification.residuals.blocks import RESIDUAL_BLOCKS
 from ...identification.residuals.rows import ResidualRows, match_points
 
 BIN_SECONDS = 0.2  # length of a time window [s]
@@ -27,7 +27,7 @@ MIN_ROWS_PER_BIN = 3  # fewer rows make no bin, where bins usually have more
 MAX_SENSORS = 1000  # grippers times axes
 CHANNELS_PER_BLOCK = 10_000  # spacing of the keys of two kinds of data
 MAD_TO_STD = 1.4826  # median absolute deviation to standard deviation of a normal distribution
-BLOCK_NAMES = tuple(block.name for block in BLOCKS)
+BLOCK_NAMES = tuple(block.name for block in RESIDUAL_BLOCKS)
 FORCE_BLOCK = BLOCK_NAMES.index("force")  # blocks before it are positions, it and later ones are measured by grippers
 
 
@@ -135,7 +135,7 @@ def bin_residuals(
         frames, depth if derivatives is None else concatenate_directions(derivatives, depth), episode, surface
     )
     parts = []
-    for b, block in enumerate(BLOCKS):
+    for b, block in enumerate(RESIDUAL_BLOCKS):
         rows = block.rows(scene)
         if rows is not None and block.name == "edges":  # zeros are pieces of the rim that nobody sees
             visible = rows.residual != 0

@@ -13,7 +13,7 @@ from ...recordings import Recording, write
 from ...recordings.templates import as_template, is_template
 from ...robots import (  # pyright: ignore[reportMissingImports] - mapped from robots/ at installation
     JointPlan,
-    replan_episode,
+    joint_motion_for_episode,
     to_gripper_motion,
 )
 from ...robots.replan_episode import scene_from_episode  # pyright: ignore[reportMissingImports]
@@ -66,17 +66,17 @@ def check_feasibility(recordings: Sequence[Recording], progress: Progress) -> li
             return FeasibleExperiment(experiment, episode, not_checked=reason)
         progress(f"{experiment}: whether the arms can do it")
         try:
-            plan = replan_episode(episode, scene)
+            plan = joint_motion_for_episode(episode, scene)
         except TorchclothError as error:
             progress(f"{experiment}: the arms cannot do it: {error}")
             return FeasibleExperiment(experiment, episode, why_not=str(error))
-        slower = replace(experiment, speed=experiment.speed / plan.slower)
+        slower = replace(experiment, speed=experiment.speed / plan.slowdown)
         paths = {name: to_gripper_motion(path) for name, path in plan.motion(scene).items()}
         grippers = {name: add_blank_readings(path, episode.grippers[name]) for name, path in paths.items()}
         planned = replace(
             episode,
             grippers=grippers,
-            joints=plan.joints(),
+            joints=plan.joint_motions(),
             points=make_blank_frames(episode, float(plan.t[-1])),
             split={"motion": str(slower)},
         )

@@ -139,7 +139,7 @@ def propose_experiment(
 def _describe_arms(choice: FeasibleExperiment, refused: Mapping[str, str]) -> dict[str, Any] | None:
     """Return what the arms can do; None if the episodes name none."""
     if choice.plan is not None:
-        return {"slowdown": choice.plan.slower, "limited_by": choice.plan.limiting, "refused": refused}
+        return {"slowdown": choice.plan.slowdown, "limited_by": choice.plan.limiting_joint, "refused": refused}
     return None if choice.not_checked is None else {"not_checked": choice.not_checked}
 
 

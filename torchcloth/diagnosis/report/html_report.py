@@ -78,7 +78,7 @@ def _collect_evidence(answer: Diagnosis) -> dict[str, Any]:
     before, after = result.held_out
     start_scores = screen(result.start)
     scores = [*start_scores, *result.scores]
-    descriptions = {s.hypothesis.effect: s.hypothesis.description for s in scores}
+    descriptions = {h.effect: h.description for h in (s.hypothesis for s in scores) if h.effect not in GLOSSARY}
     descriptions |= {c["effect"]: c["description"] for c in content["causes"]}
     meanings = {name: text for name, text in descriptions.items() if text} | GLOSSARY | EQUIVALENT_CAUSES
     listed = _list_effects(content, scores)

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from ...episodes.observed import Episode
-from ...identification.residuals.blocks import BLOCKS
+from ...identification.residuals.blocks import RESIDUAL_BLOCKS
 from ..data.binning import BIN_SECONDS, FORCE_BLOCK
 from ..decide.criteria import CRITERIA
 from ..inference.fitting import ModelFit, posterior_precision
@@ -56,7 +56,7 @@ def localise_cause(fitted: ModelFit, name: str, motions: Sequence[str], episodes
     return {
         "where": where,
         "when": {"episode": k, "motion": motions[k], "from": start, "to": end},
-        "response": {"value": float(response[selected].norm()), "unit": BLOCKS[kind].unit},
+        "response": {"value": float(response[selected].norm()), "unit": RESIDUAL_BLOCKS[kind].unit},
     }
 
 
