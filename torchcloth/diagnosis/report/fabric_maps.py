@@ -14,7 +14,7 @@ from ..inference.linearise import Linearisation
 POINTS_BLOCK = BLOCK_NAMES.index("points")
 SHOWN_QUANTILE = 0.98  # of the misfit at the end of the colour bar
 TILE_PIXELS = 49  # along each side of a tile
-MIN_COLOUR_LIMIT_MM = 1.0  # a shorter colour bar would dramatise noise
+MIN_MAP_COLOUR_LIMIT_MM = 1.0  # a shorter colour bar would dramatise noise
 
 
 def draw_misfit_maps(
@@ -67,7 +67,7 @@ def choose_misfit_limit(*linearisations: Linearisation) -> float:
     sizes = [b.value[b.block == POINTS_BLOCK].abs().numpy() for result in linearisations for b in result.bins]
     size = np.concatenate(sizes)
     return (
-        max(1e3 * float(np.quantile(size, SHOWN_QUANTILE)), MIN_COLOUR_LIMIT_MM) if len(size) else MIN_COLOUR_LIMIT_MM
+        max(1e3 * float(np.quantile(size, SHOWN_QUANTILE)), MIN_MAP_COLOUR_LIMIT_MM) if len(size) else MIN_MAP_COLOUR_LIMIT_MM
     )
 
 
