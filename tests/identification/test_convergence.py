@@ -12,14 +12,14 @@ from torchcloth.identification.estimators.convergence import CONVERGENCE_CRITERI
 from torchcloth.identification.estimators.search import Search
 from torchcloth.training.studies import cost
 
-MEMBRANE = cost.SHEET.membrane  # N/m, of the truth; the start has 2.5 times as much
+MEMBRANE = cost.SHEET_FABRIC.membrane  # N/m, of the truth; the start has 2.5 times as much
 NUISANCES = {"grasp": 1e-3}
 
 
 def sheet(frames):
     """Pulled between clamps whose places are known to half a millimetre, in coarse cells."""
     with twins.doubles():
-        return cost.sheet(cost.Scale(cell=0.05, frames=frames))
+        return cost.build_sheet_problem(cost.Scale(cell=0.05, frames=frames))
 
 
 @pytest.fixture(scope="module")

@@ -161,7 +161,7 @@ def test_pieces_of_cloth_that_do_not_touch_have_a_prior_each():
     )
     cloth = with_field(tc.Cloth(two, tc.materials.AEP(1e5, 0.3), 0.2), torch.full((len(faces),), 1e5))
     of_part = {"youngs_modulus": cloth.material.youngs_modulus}
-    prior = fields._FieldObjective(cloth, of_part, [], None, select_blocks(None), 1.0).root
+    prior = fields._FieldObjective(cloth, of_part, [], None, select_blocks(None), 1.0).precision_root
     covariance = torch.linalg.inv(prior @ prior.mT)
     count = len(one.faces)
     assert float(covariance[:count, :count].mean()) == pytest.approx(math.log(10) ** 2)

@@ -169,7 +169,7 @@ def test_frames_are_remembered_and_simulations_counted(short):
     assert problem.simulations == 2 + 2 * len(unknowns)
     for k in range(5):
         problem.observe(problem.start + 0.01 * k)
-    assert len(problem._recent) == 4  # frames are large
+    assert len(problem._recent_frames) == 4  # frames are large
 
 
 def test_two_episodes_have_frames_of_their_own(short):

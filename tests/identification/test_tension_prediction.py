@@ -201,7 +201,7 @@ def test_files_that_are_no_fit(fit, tmp_path):
         model | {"tables": [table | {"left_out_misfit": {"lateral": 0.02}}, *others]},
         model | {"material": []},
     ]
-    for damage in ({}, *({**content, "model": m} for m in models)):
+    for damage in ({"schema": content["schema"]}, *({**content, "model": m} for m in models)):
         path.write_text(json.dumps(damage))
         with pytest.raises(RecordingError, match=r"tension\.json: does not say which model was fitted"):
             read_tension_model(tmp_path)
