@@ -1,21 +1,120 @@
 """Every Python block of the README and the documentation runs as it stands.
 
 The blocks of one page run in order, in one namespace, in an empty folder. ``PREPARE`` puts there what the page's text
-assumes: files of a reader, or names that an earlier sentence describes.
+assumes: files of a reader, or names that an earlier sentence describes. ``CHECK`` holds assertions on the results.
 """
 
+import json
 import re
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
+from helpers import foreign_formats
+
+import torchcloth as tc
+from torchcloth import recordings
+from torchcloth.cli import main
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
 BLOCK = re.compile(r"^```python\n(.*?)^```", re.DOTALL | re.MULTILINE)
-PREPARE: dict[str, Callable[[Path], dict[str, Any]]] = {}
+PREPARE: dict[str, Callable[[Path], dict[str, Any]]] = {}  # page: files and names that its text assumes
+CHECK: dict[str, Callable[[dict[str, Any]], None]] = {}  # page: what must hold after its blocks
+SLOW_PAGES = {"docs/tutorials/from-depth-images-to-a-fabric.md"}
+CLOTH_HEIGHT_M = 0.3  # over the table of the depth images
+HALF_SHEET_M = 0.1
+
+
+def prepare_arm(folder: Path) -> dict[str, Any]:
+    """Write a Rizon's URDF under another name, with another name of the tool."""
+    urdf = Path(tc.robots.__file__).parent / "urdf" / "rizon4.urdf"
+    (folder / "my.urdf").write_text(urdf.read_text().replace('"tcp_closed"', '"tip"'))
+    return {}
+
+
+def prepare_depth_images(folder: Path) -> dict[str, Any]:
+    """Write the depth images of a camera 1 m over a table that looks down on a square of cloth."""
+    pose = np.array([[0.0, 1, 0, 0.5], [1, 0, 0, 0], [0, 0, -1, 1], [0, 0, 0, 1]])
+    depth = np.full((120, 160), 1000, np.uint16)
+    depth[40:80, 60:100] = round(1000 * (1 - CLOTH_HEIGHT_M))
+    images = folder / "my_episode" / "cam0" / "depth"
+    images.mkdir(parents=True)
+    for i in range(2):
+        (images / f"{i:06d}.png").write_bytes(foreign_formats.png(depth))
+    (images.parent / "timestamps.csv").write_text("frame,t_color,t_depth\n0,,0.0\n1,,0.5\n")
+    matrix = [[140.0, 0, 79.5], [0, 140.0, 59.5], [0, 0, 1]]
+    size = {"width": 160, "height": 120, "depth_scale": 0.001}
+    message = {**foreign_formats.KNOWN, "format": "torchcloth-recording", "version": 1}
+    message["cloth"] = message["cloth"] | {"sheet": {"width": 2 * HALF_SHEET_M, "height": 2 * HALF_SHEET_M}}
+    message["cameras"] = {"cam0": {**size, "K": matrix, "T_world_camera": pose.tolist()}}
+    (folder / "my_episode" / "episode.json").write_text(json.dumps(message))
+    return {}
+
+
+def prepare_bench(folder: Path) -> dict[str, Any]:
+    """Run the tutorial's command at a lower frame rate, which leaves few depth images."""
+    options = ["--garment", "sheet", "--motion", "swing", "--triangles", "128", "--no-pictures", "--rate", "3"]
+    assert main(["simulate", *options, "--out", str(folder / "bench")]) == 0
+    return {}
+
+
+PREPARE |= {
+    "docs/how-to/own-arm.md": prepare_arm,
+    "docs/how-to/import-recordings.md": prepare_depth_images,
+    "docs/tutorials/from-depth-images-to-a-fabric.md": prepare_bench,
+}
+
+
+def check_layer(namespace: dict[str, Any]) -> None:
+    assert torch.isfinite(namespace["q"].grad).all()
+    assert float(namespace["q"].grad.abs().max()) > 0
+    assert namespace["cloth"].material.youngs_modulus.raw.grad.abs().item() > 0
+
+
+def check_arm(namespace: dict[str, Any]) -> None:
+    assert namespace["rig"]["hand"].frame == "tip"
+    assert set(namespace["plan"].q) == {"hand"}
+
+
+def check_imports(namespace: dict[str, Any]) -> None:
+    """The cloud and the first shape lie where the cloth is, and the episode from arrays can be fitted."""
+    points = recordings.read("my_episode_points").require("points")
+    np.testing.assert_array_equal(points.t, [0, 0.5])
+    assert points.counts.min() > 150
+    np.testing.assert_allclose(points.xyz[:, 2], CLOTH_HEIGHT_M, atol=1e-4)
+    half_side = 40 / 140 * (1 - CLOTH_HEIGHT_M) / 2
+    assert 0.85 * half_side < np.abs(points.xyz[:, :2] - [0.5, 0]).max() <= half_side
+    first = recordings.read("my_episode_ready").cloth.initial_vertices
+    np.testing.assert_allclose(first[:, 2], CLOTH_HEIGHT_M, atol=2e-3)
+    np.testing.assert_allclose(np.ptp(first[:, :2], axis=0), 2 * HALF_SHEET_M, atol=5e-3)
+    assert main(["identify", "from_arrays", "--out", "fit", "--fit", "air.normal", "--iterations", "1"]) == 0
+    assert json.loads(Path("fit/identification.json").read_text())["parameters"]["air.normal"]
+
+
+def check_tension(namespace: dict[str, Any]) -> None:
+    assert namespace["fit"].parameters["shear_modulus"].identifiable
+    assert main(["predict", "nylon", "--angle", "30", "--out", "thirty"]) == 0
+
+
+def check_bench(namespace: dict[str, Any]) -> None:
+    """The first shape is near the true one, and the episode is complete."""
+    episode = recordings.read("my_episode_ready")
+    truth = recordings.read("bench/sheet_swing").require("truth").vertices[0]
+    assert np.abs(episode.cloth.initial_vertices.mean(0) - truth.mean(0)).max() < 0.03
+    assert min(episode.require("points").counts) > 1000
+
+
+CHECK |= {
+    "README.md": check_layer,
+    "docs/how-to/own-arm.md": check_arm,
+    "docs/how-to/import-recordings.md": check_imports,
+    "docs/how-to/tension-machine.md": check_tension,
+    "docs/tutorials/from-depth-images-to-a-fabric.md": check_bench,
+}
 
 
 def read_blocks(page: Path) -> list[str]:
@@ -26,11 +125,20 @@ def page_name(page: Path) -> str:
     return page.relative_to(ROOT).as_posix()
 
 
-@pytest.mark.parametrize("page", [page for page in PAGES if read_blocks(page)], ids=page_name)
+def list_pages() -> list[Any]:
+    names = [page_name(page) for page in PAGES if read_blocks(page)]
+    return [pytest.param(name, id=name, marks=[pytest.mark.slow] * (name in SLOW_PAGES)) for name in names]
+
+
+@pytest.mark.parametrize("page", list_pages())
 def test_the_blocks_of_a_page_run(page, tmp_path, monkeypatch):
     torch.set_default_dtype(torch.float32)  # as in a reader's session
     monkeypatch.chdir(tmp_path)
-    namespace = PREPARE.get(page_name(page), lambda folder: {})(tmp_path)
-    for number, block in enumerate(read_blocks(page), start=1):
-        exec(compile(block, f"{page_name(page)}, block {number}", "exec"), namespace)
-    torch.set_default_dtype(torch.float32)
+    namespace = PREPARE.get(page, lambda folder: {})(tmp_path)
+    for number, block in enumerate(read_blocks(ROOT / page), start=1):
+        exec(compile(block, f"{page}, block {number}", "exec"), namespace)
+    CHECK.get(page, lambda namespace: None)(namespace)
+
+
+def test_every_prepared_page_exists():
+    assert {*PREPARE, *CHECK, *SLOW_PAGES} <= {page_name(page) for page in PAGES}
