@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 import importlib
-import json
+import re
 from pathlib import Path
 
 from mkdocs.structure.files import File, Files
@@ -116,7 +116,20 @@ def api_page(room: str) -> str:
     return "\n".join(text) + "\n"
 
 
-def on_env(env, config, files):
-    """Offer the result schemas to the pages that render them as tables."""
-    env.globals["schemas"] = {p.stem: json.loads(p.read_text()) for p in (ROOT / "torchcloth").rglob("*.schema.json")}
-    return env
+def on_page_markdown(markdown: str, page, config, files) -> str:
+    """Fill placeholders ``<!-- table: NAME -->`` with generated tables."""
+    return re.sub(r"<!-- table: ([\w.#/-]+) -->", lambda match: make_table(match[1]), markdown)
+
+
+def make_table(name: str) -> str:
+    """Return a generated table as Markdown.
+
+    Args:
+        name: "causes".
+    """
+    from torchcloth.diagnosis.causes.glossary import format_catalogue
+    from torchcloth.diagnosis.causes.hypotheses import list_known_hypotheses
+
+    if name == "causes":
+        return format_catalogue(list_known_hypotheses())
+    raise ValueError(f"no table is called {name!r}")

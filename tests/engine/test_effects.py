@@ -5,6 +5,7 @@ import torch
 from helpers.engine_agreement import GRADIENTS, agree, difference, layer_transposes, moving, moving_hand, noise, outcome
 
 import torchcloth as tc
+from torchcloth.diagnosis.causes.catalogue import list_effect_classes
 from torchcloth.dynamics import substep
 from torchcloth.engine import fused
 from torchcloth.engine.builder import UnsupportedPart
@@ -69,6 +70,11 @@ EFFECTS = {
     "body force": lambda: E.BodyForce(torch.tensor([[0.5, -1.0, 2.0]])),
     "body force of vertices": lambda: E.BodyForce(torch.sin(torch.arange(72.0)).reshape(24, 3)),
 }
+
+
+TESTED_BELOW = (E.CreasingBending, E.GripSlip, E.RestShape)  # they need a bent state, a grip, or axes
+BY_HAND = {type(effect) for effect in (*(make() for make in EFFECTS.values()), *standard().values())}
+EFFECTS |= {e.__name__: e for e in list_effect_classes() if e not in (*BY_HAND, *TESTED_BELOW)}  # as constructed
 
 
 @pytest.mark.parametrize("name", EFFECTS)

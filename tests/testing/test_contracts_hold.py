@@ -6,6 +6,7 @@ import torch
 import trimesh
 
 import torchcloth as tc
+from torchcloth.diagnosis.causes.catalogue import list_effect_classes
 from torchcloth.testing import (
     BoundaryContract,
     ColliderContract,
@@ -341,6 +342,37 @@ class TestElliptic(TestSolidPlane):
         return tc.boundaries.Plane(friction=tc.boundaries.Elliptic(0.4, 0.2, (0.6, 0.8, 0.0)), **options)
 
 
+class DefaultEffect(EffectContract):
+    """An effect as its constructor makes it, with one parameter at the amplitude."""
+
+    def __init__(self, effect, parameter):
+        self.effect, self.amplitude = effect, parameter
+
+    def make(self, amplitude):
+        return self.effect(**{self.amplitude: amplitude})
+
+
+DefaultEffect.__test__ = False
+
+
+def list_cases_by_hand():
+    """(effect class, parameter) of the contract tests above."""
+    cases = [c() for name, c in globals().items() if name.startswith("Test") and issubclass(c, EffectContract)]
+    pairs = [(type(case.make(0.1)), case.amplitude) for case in cases]
+    return {(effect, parameter or next(iter(effect.amplitudes))) for effect, parameter in pairs}
+
+
+def test_every_declared_amplitude_keeps_the_contract():
+    """What an effect declares beside its parents' amplitudes has a case above, or is tested as it is constructed."""
+    known = list_cases_by_hand()
+    assert (tc.effects.AirDrag, "wind") in known
+    for effect in list_effect_classes():
+        inherited = {name for parent in effect.__mro__[1:] for name in getattr(parent, "amplitudes", ())}
+        for parameter in effect.amplitudes.keys() - inherited:
+            if (effect, parameter) not in known and effect is not tc.effects.ResidualForce:
+                DefaultEffect(effect, parameter).check()
+
+
 def test_contracts_do_not_depend_on_the_default_precision():
     """A user's tests run with float32 by default."""
     torch.set_default_dtype(torch.float32)
@@ -354,7 +386,7 @@ def test_contracts_do_not_depend_on_the_default_precision():
 def test_the_example_in_the_docstring():
     """What a reader copies keeps the contract."""
     text = textwrap.dedent(
-        tc.effects.AbstractEffect.__doc__.split("A constant force per vertex:\n\n")[1].split("    Class attributes")[0]
+        tc.effects.AbstractEffect.__doc__.split("A constant force per vertex:\n\n")[1].split("    In all hooks")[0]
     )
     scope = {"torch": torch, "torchcloth": tc, "PhysicalParameter": tc.PhysicalParameter}
     scope |= {name: getattr(tc.effects, name) for name in ("AbstractEffect", "Amplitude")}

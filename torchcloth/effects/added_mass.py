@@ -36,7 +36,16 @@ class AddedMass(AbstractEffect):
         InvalidInput: negative length or non-positive density.
     """
 
-    amplitudes = {"length": Amplitude("m", 0.15, 0.015, ("gravity.acceleration", "plane.friction"))}
+    amplitudes = {
+        "length": Amplitude(
+            "m",
+            0.15,
+            confounded_with=("Gravity.acceleration", "contact.mu"),
+            cause="air.added_mass",
+            title="Added mass of air",
+            description="Air that the cloth carries along makes it heavier to shake and no heavier to hold.",
+        ),
+    }
     per_triangle = ("length",)
 
     def __init__(self, length: float | Tensor = 0.15, density: float = STANDARD_AIR_DENSITY_KG_PER_M3) -> None:

@@ -40,7 +40,16 @@ class Adhesion(AbstractEffect):
         InvalidInput: negative stress, a gap that is not positive, a zero normal.
     """
 
-    amplitudes = {"stress": Amplitude("Pa", 1.5, 0.3, ("contact.mu",))}
+    amplitudes = {
+        "stress": Amplitude(
+            "Pa",
+            1.5,
+            confounded_with=("contact.mu",),
+            cause="contact.adhesion",
+            title="Adhesion to the table",
+            description="Cloth that touches the table is pulled to it: a charge, moisture, or fibres that catch.",
+        ),
+    }
     per_triangle = ()
 
     def __init__(

@@ -53,9 +53,32 @@ class AirDrag(AbstractEffect):
     """
 
     amplitudes = {
-        "normal": Amplitude("-", 1.2, 0.05, ("mass_damping",)),
-        "tangential": Amplitude("-", 0.016, 0.005, ("mass_damping",)),
-        "wind": Amplitude("m/s", 0.3, 0.05, ("gravity.tilt",)),
+        "normal": Amplitude(
+            "-",
+            1.2,
+            confounded_with=("air.linear",),
+            cause="air.drag_n",
+            title="Air drag, normal (C_n)",
+            description="Air pushes against cloth that moves broadside, by the square of its speed "
+            "(1.2: a flat plate).",
+        ),
+        "tangential": Amplitude(
+            "-",
+            0.016,
+            confounded_with=("air.linear",),
+            cause="air.drag_t",
+            title="Air drag, tangential (C_t)",
+            description="Air rubs along cloth that moves edgewise; as a rule too little to be seen.",
+        ),
+        "wind": Amplitude(
+            "m/s",
+            0.3,
+            confounded_with=("env.gravity_tilt",),
+            signed=True,
+            cause="air.wind",
+            title="Wind",
+            description="The air itself moves, along x or y of the world.",
+        ),
     }
     per_triangle = ("normal", "tangential")
     acts_on = "triangles"

@@ -5,7 +5,8 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Collection, Mapping
-from typing import Any, ClassVar, Literal, NamedTuple
+from dataclasses import dataclass
+from typing import Any, ClassVar, Literal
 
 from torch import Tensor, nn
 
@@ -13,21 +14,50 @@ from ..errors import InvalidInput
 from ..meshes import Mesh
 from ..types import EffectInputs, Surface
 
+SMALLEST_FRACTION_OF_TYPICAL = 0.4  # smallest effect of interest, where a declaration gives none
 
-class Amplitude(NamedTuple):
-    """Scale of an effect's parameter. At 0 that part of the effect is switched off.
+
+@dataclass(frozen=True)
+class Amplitude:
+    """Scale of an effect's parameter, and the cause that a diagnosis makes of it. At 0 that part is switched off.
+
+    Priors of fits, the catalogue of causes, its glossary and its page follow from this declaration.
 
     Attributes:
         unit: SI unit.
-        typical: value in an ordinary case.
-        smallest: smallest effect of interest.
-        equivalences: effects or parameters that data can hardly distinguish from this one.
+        typical: value in an ordinary case. The prior of a fit has twice it as standard deviation.
+        smallest: smallest effect of interest; None: 0.4 of the amplitude that a diagnosis calls typical.
+        confounded_with: causes of the catalogue ("air.linear") or parameters ("Bending.stiffness") that data can
+            hardly distinguish from this one.
+        signed: whether negative values make sense.
+        cause: name of the cause in the catalogue, without axis; empty: a diagnosis does not ask about it.
+        title: title of the cause in reports.
+        description: the cause in one sentence, for reports.
+        diagnosis_typical: typical amplitude of the cause, from published magnitudes; None: ``typical``. It differs
+            where the scale of the prior was chosen for other fabrics. Both decide results, so both are declared.
     """
 
     unit: str
     typical: float
-    smallest: float
-    equivalences: tuple[str, ...] = ()
+    smallest: float | None = None
+    confounded_with: tuple[str, ...] = ()
+    signed: bool = False
+    cause: str = ""
+    title: str = ""
+    description: str = ""
+    diagnosis_typical: float | None = None
+
+    @property
+    def typical_of_cause(self) -> float:
+        """Typical amplitude in a diagnosis, in ``unit``."""
+        return self.typical if self.diagnosis_typical is None else self.diagnosis_typical
+
+    @property
+    def smallest_fraction(self) -> float:
+        """Smallest effect of interest, as a fraction of the typical amplitude in a diagnosis."""
+        if self.smallest is None:
+            return SMALLEST_FRACTION_OF_TYPICAL
+        return abs(self.smallest / self.typical_of_cause)
 
 
 class AbstractEffect(nn.Module, ABC):

@@ -47,6 +47,17 @@ class Coefficients(NamedTuple):
     mobility: Tensor | None = None
 
 
+_CURL = Amplitude(
+    "1/m",
+    3.0,
+    confounded_with=("plast.crease",),
+    signed=True,
+    cause="rest.curl",
+    title="Curl at rest",
+    description="The cloth at rest is curved along warp or weft, to one of its sides.",
+)
+
+
 class Bending(AbstractEffect):
     """Bending of a sheet: a Kirchhoff plate, orthotropic in material axes, on the material's second derivatives.
 
@@ -80,9 +91,17 @@ class Bending(AbstractEffect):
 
     amplitudes = {
         "stiffness": Amplitude("N m", 1e-5, 1e-6),
-        "damping_time": Amplitude("s", 0.03, 3e-3, ("internal_friction", "mass_damping")),
-        "curl_warp": Amplitude("1/m", 3.0, 0.3, ("crease",)),
-        "curl_weft": Amplitude("1/m", 3.0, 0.3, ("crease",)),
+        "damping_time": Amplitude(
+            "s",
+            0.03,
+            confounded_with=("fric.internal_bend", "air.linear"),
+            cause="damp.bend",
+            title="Damping of bending",
+            description="Bending is damped: ripples die out sooner than swings.",
+            diagnosis_typical=0.05,
+        ),
+        "curl_warp": _CURL,
+        "curl_weft": _CURL,
     }
     per_triangle = ("stiffness",)
 

@@ -35,7 +35,15 @@ class CreasingBending(Bending):
     """
 
     amplitudes = {
-        "mobility": Amplitude("1/s", 10.0, 0.1, ("rest_curvature", "internal_friction")),
+        "mobility": Amplitude(
+            "1/s",
+            10.0,
+            confounded_with=("rest.curl", "fric.internal_bend"),
+            cause="plast.crease",
+            title="Creases",
+            description="Sharp folds stay: the cloth's rest shape follows strong bending.",
+            diagnosis_typical=5.0,
+        ),
         **Bending.amplitudes,
     }
 

@@ -21,7 +21,17 @@ class MassDamping(AbstractEffect):
         InvalidInput: negative rate.
     """
 
-    amplitudes = {"rate": Amplitude("1/s", 1.0, 0.05, ("air",))}
+    amplitudes = {
+        "rate": Amplitude(
+            "1/s",
+            1.0,
+            confounded_with=("air.drag_n",),
+            cause="air.linear",
+            title="Linear damping",
+            description="Something slows the cloth in proportion to its mass and speed.",
+            diagnosis_typical=2.0,
+        ),
+    }
     per_triangle = ()
 
     def __init__(self, rate: float | Tensor = 1.0) -> None:

@@ -31,7 +31,17 @@ class BendingFriction(AbstractEffect):
         InvalidInput: values out of range.
     """
 
-    amplitudes = {"moment": Amplitude("N", 2e-4, 2e-5, ("bending_damping", "crease"))}
+    amplitudes = {
+        "moment": Amplitude(
+            "N",
+            2e-4,
+            confounded_with=("damp.bend", "plast.crease"),
+            cause="fric.internal_bend",
+            title="Internal friction in bending",
+            description="Yarns rub when the cloth bends, so that it keeps a part of its last shape.",
+            diagnosis_typical=3e-4,
+        ),
+    }
     per_triangle = ()
 
     def __init__(self, moment: float | Tensor = 2e-4, threshold: float = 5.0) -> None:
@@ -88,7 +98,16 @@ class ShearFriction(AbstractEffect):
         InvalidInput: values out of range.
     """
 
-    amplitudes = {"hysteresis": Amplitude("N/m", 1.0, 0.1, ("membrane_viscosity",))}
+    amplitudes = {
+        "hysteresis": Amplitude(
+            "N/m",
+            1.0,
+            confounded_with=("damp.kv",),
+            cause="fric.internal_shear",
+            title="Internal friction in shear",
+            description="Yarns rub when the cloth is sheared.",
+        ),
+    }
     per_triangle = ("hysteresis",)
 
     def __init__(self, hysteresis: float | Tensor = 1.0, threshold: float = 0.01) -> None:

@@ -26,8 +26,16 @@ class Gravity(AbstractEffect):
     """
 
     amplitudes = {
-        "acceleration": Amplitude("m/s^2", STANDARD_GRAVITY_M_PER_S2, 0.05, ("areal_density",)),
-        "tilt": Amplitude("rad", 0.01, 0.002, ("air.wind", "camera.rotation")),
+        "acceleration": Amplitude("m/s^2", STANDARD_GRAVITY_M_PER_S2, 0.05, ("mass.density",)),
+        "tilt": Amplitude(
+            "rad",
+            0.01,
+            confounded_with=("air.wind", "obs.rotation"),
+            signed=True,
+            cause="env.gravity_tilt",
+            title="Tilt of gravity",
+            description="The world's vertical is not where gravity points: robot and camera share a base that leans.",
+        ),
     }
 
     def __init__(

@@ -44,7 +44,13 @@ class GripSlip(AbstractEffect):
 
     amplitudes = {
         "mobility": Amplitude(
-            "m/(N s)", 0.01, 0.001, ("rest_shape.shrink_warp", "rest_shape.shrink_weft", "robot.base")
+            "m/(N s)",
+            0.01,
+            confounded_with=("rest.shrink", "obs.extrinsic"),
+            cause="grip.slip",
+            title="Slip in the grippers",
+            description="The cloth creeps out of the grippers under a strong pull.",
+            diagnosis_typical=0.05,
         ),
         "hold": Amplitude("N", 1.0, 0.1),
     }

@@ -35,7 +35,17 @@ class LineMass(AbstractEffect):
         InvalidInput: negative mass; when bound, edges that the mesh does not have, or a path outside its pattern.
     """
 
-    amplitudes = {"mass_per_length": Amplitude("kg/m", 4.5e-3, 1e-3, ("areal_density", "gravity.tilt"))}
+    amplitudes = {
+        "mass_per_length": Amplitude(
+            "kg/m",
+            4.5e-3,
+            confounded_with=("mass.density", "env.gravity_tilt"),
+            cause="mass.hem",
+            title="Mass of a hem",
+            description="A heavy line runs along the rim.",
+            diagnosis_typical=0.02,
+        ),
+    }
     per_triangle = ()
 
     def __init__(

@@ -93,7 +93,7 @@ class ResidualForce(AbstractEffect):
         InvalidInput: no term, or one that does not exist.
     """
 
-    amplitudes = {"strength": Amplitude("of the law", 1.0, 0.1, ("air", "mass_damping", "membrane_viscosity"))}
+    amplitudes = {"strength": Amplitude("of the law", 1.0, 0.1, ("air.drag_n", "air.linear", "damp.kv"))}
 
     def __init__(self, terms: Mapping[str, float], gripped_vertices: Sequence[int] = ()) -> None:
         super().__init__()

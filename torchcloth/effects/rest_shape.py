@@ -20,6 +20,18 @@ class Coefficients(NamedTuple):
     skew: Tensor
 
 
+_SHRINKAGE = Amplitude(
+    "-",
+    0.02,
+    confounded_with=("mass.density", "grip.slip", "elas.ortho"),
+    signed=True,
+    cause="rest.shrink",
+    title="Shrinkage",
+    description="The cloth is shorter along warp or weft than its pattern says.",
+    diagnosis_typical=0.03,
+)
+
+
 class RestShape(AbstractEffect):
     """The true rest shape after washing or cutting askew: shorter threads than in the pattern, at another angle.
 
@@ -42,9 +54,18 @@ class RestShape(AbstractEffect):
     """
 
     amplitudes = {
-        "shrink_warp": Amplitude("-", 0.02, 0.005, ("areal_density", "grip_slip.mobility", "material.orthotropy")),
-        "shrink_weft": Amplitude("-", 0.02, 0.005, ("areal_density", "grip_slip.mobility", "material.orthotropy")),
-        "skew": Amplitude("rad", 0.02, 0.005, ("material.orthotropy",)),
+        "shrink_warp": _SHRINKAGE,
+        "shrink_weft": _SHRINKAGE,
+        "skew": Amplitude(
+            "rad",
+            0.02,
+            confounded_with=("elas.ortho",),
+            signed=True,
+            cause="rest.skew",
+            title="Skew at rest",
+            description="Warp and weft of the cloth at rest are not at right angles.",
+            diagnosis_typical=0.03,
+        ),
     }
     per_triangle = ("shrink_warp", "shrink_weft", "skew")
 

@@ -41,7 +41,7 @@ class SaturatingBending(AbstractEffect):
         InvalidInput: values out of range.
     """
 
-    amplitudes = {"moment": Amplitude("N", 1e-3, 1e-4, ("bending", "internal_friction"))}
+    amplitudes = {"moment": Amplitude("N", 1e-3, 1e-4, ("Bending.stiffness", "fric.internal_bend"))}
     per_triangle = ()
 
     def __init__(self, moment: float | Tensor = 1e-3, curvature: float | Tensor = 2.0) -> None:

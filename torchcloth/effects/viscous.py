@@ -33,7 +33,7 @@ class KelvinVoigt(AbstractEffect):
         InvalidInput: negative viscosity.
     """
 
-    amplitudes = {"viscosity": Amplitude("N s/m", 1.0, 0.1, ("numerics", "internal_friction"))}
+    amplitudes = {"viscosity": Amplitude("N s/m", 1.0, 0.1, ("fric.internal_shear",))}
     per_triangle = ("viscosity",)
 
     def __init__(self, viscosity: float | Tensor = 1.0) -> None:

@@ -14,7 +14,8 @@ from torch import Tensor
 from ..boundaries import AbstractBoundary
 from ..cloth import Cloth
 from ..effects import AbstractEffect
-from ..errors import TorchclothError
+from ..effects.base import SMALLEST_FRACTION_OF_TYPICAL
+from ..errors import InvalidInput, TorchclothError
 from ..materials import AbstractMaterial
 from ..meshes import Mesh
 from ..recordings import Recording
@@ -158,7 +159,9 @@ class Hypothesis:
         implies: another hypothesis, which joins at its typical amplitude where the world has none of it.
         needs_fine_mesh: whether its slopes are computed on the fine mesh, if it has an effect on the given one. It then
             acts in folds, for which the given mesh is too coarse.
-        description: a sentence for reports; those of the catalogue have theirs in the glossary.
+        title: a few words for reports.
+        description: a sentence for reports.
+        effect_names: names that ``apply`` gives effects in the cloth; ``*`` stands for a gripper's or table's name.
     """
 
     name: str
@@ -166,7 +169,7 @@ class Hypothesis:
     typical: float
     apply: Callable[[World, float], World]
     signed: bool = False
-    smallest_fraction: float = 0.4
+    smallest_fraction: float = SMALLEST_FRACTION_OF_TYPICAL
     step_fraction: float = 0.1
     is_applicable: Callable[[Recording], bool] = lambda recording: True
     structurally_equivalent: tuple[str, ...] = ()
@@ -175,11 +178,65 @@ class Hypothesis:
     max_amplitude: float = math.inf
     implies: str = ""
     needs_fine_mesh: bool = False
+    title: str = ""
     description: str = ""
+    effect_names: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         if isinstance(self.structurally_equivalent, list):  # a list has no hash
             object.__setattr__(self, "structurally_equivalent", tuple(self.structurally_equivalent))
+
+    @classmethod
+    def from_amplitude(
+        cls,
+        effect: type[AbstractEffect],
+        parameter: str = "",
+        apply: Callable[[World, float], World] | None = None,
+        *,
+        axis: str = "",
+        effect_name: str = "",
+        **options: Any,
+    ) -> Hypothesis:
+        """Build a hypothesis from what an effect declares in ``amplitudes``.
+
+        Args:
+            effect: class of the effect.
+            parameter: of which the declaration is; empty: the main one.
+            apply: (world, amplitude) -> world; None: the effect joins the cloth, with its other parameters at their
+                defaults.
+            axis: follows the cause's name in brackets.
+            effect_name: name of the effect in the cloth; empty: the cause's name after its first dot.
+            options: further fields of the hypothesis, which replace declared ones.
+
+        Raises:
+            InvalidInput: the effect declares no such parameter, or no cause for it.
+        """
+        parameter = parameter or next(iter(effect.amplitudes))
+        if (amplitude := effect.amplitudes.get(parameter)) is None:
+            names = ", ".join(effect.amplitudes)
+            raise InvalidInput(f"parameter of {effect.__name__}", got=repr(parameter), expected=f"one of {names}")
+        cause = options.get("name", amplitude.cause)
+        if not cause:
+            raise InvalidInput(
+                f"amplitude {parameter!r} of {effect.__name__}", got="no cause", expected='a name, cause="my.effect"'
+            )
+        effect_name = effect_name or cause.partition(".")[2].replace(".", "_")
+
+        def add_effect(world: World, value: float) -> World:
+            return world.with_cloth({effect_name: effect(**{parameter: value})})
+
+        declared = {
+            "name": f"{cause}[{axis}]" if axis else cause,
+            "unit": amplitude.unit,
+            "typical": amplitude.typical_of_cause,
+            "apply": add_effect if apply is None else apply,
+            "signed": amplitude.signed,
+            "smallest_fraction": amplitude.smallest_fraction,
+            "title": amplitude.title,
+            "description": amplitude.description,
+            "effect_names": (effect_name,),
+        }
+        return cls(**declared | options)
 
     def apply_to(self, world: World, amplitude: float) -> World:
         """Return the world with this amplitude of the hypothesis.

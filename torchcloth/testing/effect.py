@@ -121,14 +121,15 @@ class EffectContract(Contract):
         return out
 
     def test_declares_itself(self) -> None:
-        """It declares unit, typical and smallest amplitude and equivalences, and has one row of force per element."""
+        """It declares amplitudes with unit and size, and has one row of force per element."""
         effect = self._effect()
         kind = type(effect)
         for name, size in kind.amplitudes.items():
             require(hasattr(effect, name), f"the effect has no parameter {name!r} for its amplitude")
             require(bool(size.unit), f"the amplitude {name!r} has no unit")
-            require(0 < size.smallest <= size.typical, f"smallest of {name!r} must lie in (0, typical]")
-            require(all(isinstance(other, str) for other in size.equivalences), "equivalences must be names")
+            require(size.typical > 0 or size.signed, f"typical of {name!r} must be positive, or the amplitude signed")
+            require(0 < size.smallest_fraction <= 1, f"smallest of {name!r} must lie in (0, typical]")
+            require(all(isinstance(other, str) for other in size.confounded_with), "confounded_with must be names")
         require(kind.acts_on in ("vertices", "triangles"), f"acts_on must not be {kind.acts_on!r}")
         mesh = self.mesh()
         rows = len(mesh.vertices if kind.acts_on == "vertices" else mesh.faces)

@@ -1,6 +1,6 @@
 """Map from hidden effects to the library's causes, and how a round hides each effect.
 
-The truth does not import the library's catalogue. A test compares the names with it.
+The names are written out here; a test compares them with the library's catalogue.
 """
 
 from __future__ import annotations

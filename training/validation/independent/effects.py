@@ -1,13 +1,15 @@
 """Catalogue of the effects that can be hidden in a scene. Amplitude 0 changes nothing, bit by bit.
 
-Names are those of the library's catalogue of causes. Names that begin with ``x.`` are outside it: a diagnosis can only
-say that something is unexplained.
+Names, units and typical amplitudes are those of the library's catalogue of causes; the physics is not. Names that
+begin with ``x.`` are outside it: a diagnosis can only say that something is unexplained.
 """
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 
+from torchcloth.diagnosis.causes.catalogue import CATALOGUE as CAUSES
 from torchcloth.errors import InvalidInput
 
 from .scene import Scene
@@ -20,66 +22,80 @@ class Effect:
     Attributes:
         part: part of the scene.
         field: field of that part that holds the amplitude.
-        unit: SI.
-        typical: an amplitude that real recordings have.
         motion: a motion in which the effect is visible.
         options: further fields of the part that may be set.
+        unit: SI; empty: that of the library's cause of this name.
+        typical: an amplitude that real recordings have; nan: that of the library's cause of this name.
     """
 
     part: str
     field: str
-    unit: str
-    typical: float
     motion: str = "swing"
     options: tuple[str, ...] = ()
+    unit: str = ""
+    typical: float = math.nan
 
 
-CATALOGUE = {
-    "air.drag_n": Effect("air", "normal", "-", 1.2, "swing-fast"),
-    "air.drag_t": Effect("air", "tangential", "-", 0.016, "swing-fast"),
-    "air.linear": Effect("air", "linear", "1/s", 2.0),
-    "air.added_mass": Effect("air", "added_depth", "m", 0.15),
-    "air.wind": Effect("air", "wind", "m/s", 0.3, "hang", ("heading",)),
-    "damp.kv": Effect("membrane", "viscosity", "s", 5e-3, "shake"),
-    "damp.bend": Effect("plate", "damping_time", "s", 0.05),
-    "fric.internal_bend": Effect("plate", "friction", "N", 3e-4, "swing", ("threshold",)),
-    "fric.internal_shear": Effect("membrane", "friction", "N/m", 1.0, "stretch", ("threshold",)),
-    "bend.B": Effect("plate", "stiffness", "N m", 4e-5),
-    "bend.aniso": Effect("plate", "weft", "-", -0.6),
-    "elas.ortho": Effect("membrane", "weft", "-", 0.5, "stretch"),
-    "elas.shear": Effect("membrane", "shear", "-", -0.6, "stretch"),
-    "elas.stiffen": Effect("membrane", "stiffening", "-", 10.0, "stretch"),
-    "plast.crease": Effect("plate", "crease", "1/s", 5.0, "fold-open", ("crease_yield",)),
-    "rest.curl": Effect("plate", "curl", "1/m", 3.0, "hang", ("curl_weft",)),
-    "rest.shrink": Effect("sheet", "shrink_v", "-", 0.03, "hang"),
-    "rest.shrink_u": Effect("sheet", "shrink_u", "-", 0.03, "hang"),
-    "rest.skew": Effect("sheet", "skew", "rad", 0.03, "hang"),
-    "mass.density": Effect("mass", "density", "-", 0.08, "stretch"),
-    "mass.hem": Effect("mass", "hem", "kg/m", 0.02),
-    "mass.seam": Effect("mass", "seam", "kg/m", 0.02),
-    "grip.slip": Effect("grip", "slip", "m/(s N)", 0.05, "stretch", ("slip_threshold",)),
-    "grip.width": Effect("grip", "extra_radius", "m", 0.02, "turn"),
-    "contact.mu": Effect("table", "friction", "-", 0.2, "drag"),
-    "contact.aniso": Effect("table", "anisotropy", "-", -0.5, "drag"),
-    "contact.stick": Effect("table", "static_excess", "-", 0.3, "drag", ("speed",)),
-    "contact.adhesion": Effect("table", "adhesion", "Pa", 1.5, "lift", ("gap",)),
-    "env.gravity_tilt": Effect("mass", "tilt", "rad", 0.01, "hang", ("heading",)),
-    "obs.extrinsic": Effect("sensor", "shift", "m", 4e-3, "hang", ("heading", "rotation")),
-    "obs.rotation": Effect("sensor", "lean", "rad", 0.02, "hang", ("heading",)),
-    "obs.depth_scale": Effect("sensor", "scale", "-", 0.015, "hang"),
-    "obs.depth_bias": Effect("sensor", "offset", "m", 5e-3, "hang"),
-    "obs.clock": Effect("sensor", "delay", "s", 0.03, "swing-fast"),
-    "obs.edge": Effect("sensor", "edge", "m", 8e-3, "hang"),
-    "obs.occlusion": Effect("sensor", "occlusion", "-", 0.3),
-    "obs.bias": Effect("sensor", "bias", "m", 0.7e-3, "hang", ("bias_memory",)),
-    "robot.base": Effect("grip", "base", "m", 2e-3, "hang", ("heading", "yaw")),
-    "robot.regrasp": Effect("grip", "regrasp", "m", 0.017, "hang"),
-    "x.backlash": Effect("grip", "backlash", "m", 6e-3),
-    "x.jet": Effect("air", "jet", "m/s", 1.0, "hang", ("heading", "jet_width", "jet_across", "jet_height")),
-    "x.layer_mass": Effect("mass", "layer", "-", 1.0),
-    "x.layer_stiffness": Effect("plate", "layer", "-", 7.0),
-    "x.moisture": Effect("mass", "moisture", "1/s", 0.05, "stretch"),
+_EFFECTS = {
+    "air.drag_n": Effect("air", "normal", "swing-fast"),
+    "air.drag_t": Effect("air", "tangential", "swing-fast"),
+    "air.linear": Effect("air", "linear"),
+    "air.added_mass": Effect("air", "added_depth"),
+    "air.wind": Effect("air", "wind", "hang", ("heading",)),
+    "damp.kv": Effect("membrane", "viscosity", "shake"),
+    "damp.bend": Effect("plate", "damping_time"),
+    "fric.internal_bend": Effect("plate", "friction", "swing", ("threshold",)),
+    "fric.internal_shear": Effect("membrane", "friction", "stretch", ("threshold",)),
+    "bend.B": Effect("plate", "stiffness", unit="N m", typical=4e-5),
+    "bend.aniso": Effect("plate", "weft"),
+    "elas.ortho": Effect("membrane", "weft", "stretch"),
+    "elas.shear": Effect("membrane", "shear", "stretch"),
+    "elas.stiffen": Effect("membrane", "stiffening", "stretch"),
+    "plast.crease": Effect("plate", "crease", "fold-open", ("crease_yield",)),
+    "rest.curl": Effect("plate", "curl", "hang", ("curl_weft",)),
+    "rest.shrink": Effect("sheet", "shrink_v", "hang"),
+    "rest.shrink_u": Effect("sheet", "shrink_u", "hang"),
+    "rest.skew": Effect("sheet", "skew", "hang"),
+    "mass.density": Effect("mass", "density", "stretch"),
+    "mass.hem": Effect("mass", "hem"),
+    "mass.seam": Effect("mass", "seam"),
+    "grip.slip": Effect("grip", "slip", "stretch", ("slip_threshold",)),
+    "grip.width": Effect("grip", "extra_radius", "turn"),
+    "contact.mu": Effect("table", "friction", "drag"),
+    "contact.aniso": Effect("table", "anisotropy", "drag"),
+    "contact.stick": Effect("table", "static_excess", "drag", ("speed",)),
+    "contact.adhesion": Effect("table", "adhesion", "lift", ("gap",)),
+    "env.gravity_tilt": Effect("mass", "tilt", "hang", ("heading",)),
+    "obs.extrinsic": Effect("sensor", "shift", "hang", ("heading", "rotation")),
+    "obs.rotation": Effect("sensor", "lean", "hang", ("heading",)),
+    "obs.depth_scale": Effect("sensor", "scale", "hang"),
+    "obs.depth_bias": Effect("sensor", "offset", "hang"),
+    "obs.clock": Effect("sensor", "delay", "swing-fast"),
+    "obs.edge": Effect("sensor", "edge", "hang"),
+    "obs.occlusion": Effect("sensor", "occlusion", unit="-", typical=0.3),
+    "obs.bias": Effect("sensor", "bias", "hang", ("bias_memory",), unit="m", typical=0.7e-3),
+    "robot.base": Effect("grip", "base", "hang", ("heading", "yaw"), unit="m", typical=2e-3),
+    "robot.regrasp": Effect("grip", "regrasp", "hang"),
+    "x.backlash": Effect("grip", "backlash", unit="m", typical=6e-3),
+    "x.jet": Effect(
+        "air", "jet", "hang", ("heading", "jet_width", "jet_across", "jet_height"), unit="m/s", typical=1.0
+    ),
+    "x.layer_mass": Effect("mass", "layer", unit="-", typical=1.0),
+    "x.layer_stiffness": Effect("plate", "layer", unit="-", typical=7.0),
+    "x.moisture": Effect("mass", "moisture", "stretch", unit="1/s", typical=0.05),
 }
+_CAUSE_OF_EFFECT = {"rest.shrink_u": "rest.shrink"}  # axes have effects of their own here
+
+
+def _with_size(name: str, effect: Effect) -> Effect:
+    """Return the effect with unit and typical amplitude of the library's cause, where it has none of its own."""
+    if effect.unit:
+        return effect
+    cause = next(c for c in CAUSES if c.effect == _CAUSE_OF_EFFECT.get(name, name))
+    return replace(effect, unit=cause.unit, typical=cause.typical)
+
+
+CATALOGUE = {name: _with_size(name, effect) for name, effect in _EFFECTS.items()}
 
 
 def add_effect(scene: Scene, name: str, amplitude: float, options: dict[str, float] | None = None) -> Scene:
