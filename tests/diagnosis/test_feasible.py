@@ -76,7 +76,7 @@ def test_what_is_in_the_arms_way_is_said_and_not_proposed(shipped, monkeypatch):
     proposed = proposal.propose_experiment(found, content, setting, quiet)
     assert (proposed.content["motion"], proposed.content["arms"]) == ("turn", None)
     assert proposed.episode is turn.episode
-    plan = SimpleNamespace(slower=1.3, limiting="joint4 of left: acceleration")
+    plan = SimpleNamespace(slowdown=1.3, limiting_joint="joint4 of left: acceleration")
     monkeypatch.setattr(proposal, "check_feasibility", lambda *_: [hang, replace(turn, plan=plan)])
     arms = proposal.propose_experiment(found, content, setting, quiet).content["arms"]
     assert arms == {"slowdown": 1.3, "limited_by": plan.limiting_joint, "refused": {"hang": refused.why_not}}

@@ -68,7 +68,7 @@ def test_who_asks_later_is_told_the_same(made, asked):
 @pytest.mark.parametrize(("memory", "again"), [(2**30, 0), (0, 2)])
 def test_the_point_itself_is_simulated_once(made, asked, monkeypatch, memory, again):
     """On both meshes; beside it each of three causes, one of them on the finer mesh, too."""
-    model, setting = made[0], replace(made[1], recent=LRUCache(memory, lambda frames: 1))
+    model, setting = made[0], replace(made[1], recent_frames=LRUCache(memory, lambda frames: 1))
     known, simulate, simulated = linearise(model, setting, asked[:1]), World.simulate, []
 
     def counted(world, *arguments):

@@ -87,7 +87,7 @@ def test_what_a_fit_leaves_out_of_a_model_is_said_with_what_allows_for_it(made):
     late, mine = describe_causes_outside_cloth(base.with_hypothesis(clock, -0.03).with_hypothesis(own, 0.02))
     where = "of the model is of robot or camera and not in the cloth"
     assert late == f"obs.clock = -0.03 {where}: --nuisance clock allows for it"
-    assert mine == f"my.view = 0.02 {where}: nothing here allows for it"
+    assert mine == f"my.view = 0.02 {where}: no option allows for it"
 
 
 def test_what_was_confirmed_goes_with_its_models(tmp_path):
@@ -253,8 +253,8 @@ def test_a_table_that_one_episode_has_is_in_the_scene_of_all(made):
     over = replace(sheet_episodes.episode("lift", duration=0.4), colliders={"table": plane})
     free = sheet_episodes.episode("fast", duration=0.5)
     models = [folder / name for name in ("base.tcm", "extended.tcm")]
-    one, other = (dx.confirm(*models, order).motions["lift"] for order in ([free, over], [over, free]))
-    assert one.after == pytest.approx(other.after, rel=1e-9)
+    one, other = (dx.confirm(*models, order).gain_by_motion["lift"] for order in ([free, over], [over, free]))
+    assert one.rms_after == pytest.approx(other.rms_after, rel=1e-9)
 
 
 def test_the_bases_metres_hardly_depend_on_what_it_is_compared_with(made, tmp_path):
@@ -270,12 +270,14 @@ def test_the_bases_metres_hardly_depend_on_what_it_is_compared_with(made, tmp_pa
         path = dx.save_model(tmp_path / f"{name}-{amplitude}.tcm", base.with_hypothesis(by[name], amplitude), blank)
         found.append(dx.confirm(folder / "base.tcm", path, [seen]))
     for f in found:
-        assert f.total_gain.before == pytest.approx(found[0].total_gain.before, rel=0.03)
-        assert f.motions["fast"].before == pytest.approx(found[0].motions["fast"].before, rel=0.03)
-    assert found[0].total_gain.after < found[1].total_gain.after < 0.9 * found[1].total_gain.before
-    assert (found[0].confirmed, found[2].confirmed) == (True, False)
+        assert f.total_gain.rms_before == pytest.approx(found[0].total_gain.rms_before, rel=0.03)
+        assert f.gain_by_motion["fast"].rms_before == pytest.approx(
+            found[0].gain_by_motion["fast"].rms_before, rel=0.03
+        )
+    assert found[0].total_gain.rms_after < found[1].total_gain.rms_after < 0.9 * found[1].total_gain.rms_before
+    assert (found[0].is_confirmed, found[2].is_confirmed) == (True, False)
     assert found[1].total_gain.log_density > 0, "a third of it: by one short episode not beyond doubt"
-    assert all(f.floor < 1e-3 for f in found), "half a millimetre a point, of which a cell has several"
+    assert all(f.noise_floor < 1e-3 for f in found), "half a millimetre a point, of which a cell has several"
 
 
 def test_friction_stays_above_none_and_a_table_tells_how_high_a_camera_stands(made):

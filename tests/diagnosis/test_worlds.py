@@ -64,7 +64,7 @@ def test_nothing_at_zero_and_twice_as_much_at_twice(made, name):
         return
     share = (0.05, 0.1)
     moved = [(model.build_world([(h, s * h.typical)]).simulate_observed(e), s) for s in share]
-    small, twice = ((f.x - base.x).norm() + (f.edge - base.edge).norm() for f, _ in moved)
+    small, twice = ((f.x - base.x).norm() + (f.rim_offset - base.rim_offset).norm() for f, _ in moved)
     shows = float(twice) > 1e-4  # m, of all vertices and frames together: else the substep, chosen anew, does
     assert shows == (name not in HARDLY_VISIBLE), float(twice)
     if shows:
@@ -429,7 +429,7 @@ def test_drag_beside_wind_says_what_it_counts_from(made):
     by = {h.name: h for h in EVERY}
     both = model.with_hypothesis(by["air.wind[x]"], 0.3).with_hypothesis(by["air.drag_n"], 0.4)
     assert both.build_world().cloth.effects["air"].normal.value.item() == pytest.approx(1.6)
-    assert warn_of_implied_amplitudes(both) == ["air.drag_n = 0.4 comes on top of the 1.2 that air.wind[x] brought"]
+    assert warn_of_implied_amplitudes(both) == ["air.drag_n = 0.4 comes on top of the 1.2 that air.wind[x] implies"]
     assert (
         warn_of_implied_amplitudes(model.with_hypothesis(by["air.drag_n"], 0.4).with_hypothesis(by["air.wind[x]"], 0.3))
         == []

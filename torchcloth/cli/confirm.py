@@ -64,14 +64,14 @@ def _print(confirmation: Any) -> None:
     table = Table(title="Held-out episodes: misfit of both models", title_justify="left")
     for heading in ("motion", "base, mm", "extended, mm", "explained", "log density"):
         table.add_column(heading, justify="left" if heading == "motion" else "right")
-    for name, gain in confirmation.motions.items():
+    for name, gain in confirmation.gain_by_motion.items():
         table.add_row(escape(name), *_format_gain(gain))
     table.add_section()
-    table.add_row("all", *_format_gain(confirmation.whole))
+    table.add_row("all", *_format_gain(confirmation.total_gain))
     console = Console()
     console.print(table)
-    verdict = "The gain is confirmed" if confirmation.confirmed else "No gain is confirmed: an interval includes 0"
-    console.print(f"{verdict}. A true model would leave {1e3 * confirmation.floor:.2f} mm ({confirmation.source}).")
+    verdict = "The gain is confirmed" if confirmation.is_confirmed else "No gain is confirmed: an interval includes 0"
+    console.print(f"{verdict}. A correct model would leave {1e3 * confirmation.noise_floor:.2f} mm ({confirmation.floor_source}).")
 
 
 def _format_gain(gain: Gain) -> list[str]:
