@@ -10,23 +10,19 @@ import torch
 torch.set_num_threads(1)
 
 
-@pytest.hookimpl(trylast=True)  # once it is known which are left out
-def pytest_collection_modifyitems(items):
-    """What takes longest comes first: at the end one of the workers would wait for it.
+LONGEST_FIRST = ("test_hidden_round.py", "test_notebooks.py", "test_demo.py", "test_diagnose.py", "test_resuming.py")
 
-    Each of the three that `make test` has begins with a third of the tests as they stand here: one with the notebooks,
-    one with the hidden round.
-    """
-    of = lambda name: [item for item in items if item.path.name == name]  # noqa: E731
-    first, second = of("test_notebooks.py"), of("test_hidden_round.py")
-    others = [item for item in items if item not in (*first, *second)]
-    head = max(0, len(items) // 3 + 1 - len(first))
-    items[:] = [*first, *others[:head], *second, *others[head:]]
+
+@pytest.hookimpl(trylast=True)  # after deselection
+def pytest_collection_modifyitems(items):
+    """Run the longest tests first, so that no worker waits for them at the end."""
+    order = {name: rank for rank, name in enumerate(LONGEST_FIRST)}
+    items.sort(key=lambda item: order.get(item.path.name, len(order)))
 
 
 @pytest.fixture(autouse=True)
 def _float64():
-    """Physics is verified in float64; tests of float32 set it themselves. What is drawn is drawn alike every time."""
+    """Verify physics in float64, with a fixed seed; tests of float32 set it themselves."""
     torch.manual_seed(0)
     torch.set_default_dtype(torch.float64)
     yield
@@ -35,7 +31,7 @@ def _float64():
 
 @pytest.fixture(scope="session")
 def realdata() -> Path:
-    """Folder of measured data; skips where none is named."""
+    """Return the folder of measured data; skip where none is named."""
     folder = os.environ.get("TORCHCLOTH_REALDATA")
     if not folder:
         pytest.skip("TORCHCLOTH_REALDATA does not name a folder of measured data")
@@ -45,7 +41,7 @@ def realdata() -> Path:
 
 @pytest.fixture(scope="session")
 def measured_in(realdata: Path) -> Callable[[str], Path]:
-    """The folder of a source by name; skips where it is absent."""
+    """Return a function that finds the folder of a source by name, and skips where it is absent."""
 
     def find(name: str) -> Path:
         if not (realdata / name).is_dir():
