@@ -10,14 +10,22 @@ import torch
 torch.set_num_threads(1)
 
 
-LONGEST_FIRST = ("test_hidden_round.py", "test_notebooks.py", "test_demo.py", "test_diagnose.py", "test_resuming.py")
+WORKERS = 3  # of `make test`; each begins with a third of the tests
+LONGEST_FILES = ("test_hidden_round.py", "test_diagnose.py", "test_resuming.py", "test_demo.py", "test_notebooks.py")
 
 
 @pytest.hookimpl(trylast=True)  # after deselection
 def pytest_collection_modifyitems(items):
-    """Run the longest tests first, so that no worker waits for them at the end."""
-    order = {name: rank for rank, name in enumerate(LONGEST_FIRST)}
-    items.sort(key=lambda item: order.get(item.path.name, len(order)))
+    """Let each worker begin with long tests, so that none waits for another at the end."""
+    long = {name: [item for item in items if item.path.name == name] for name in LONGEST_FILES}
+    others = [item for item in items if item.path.name not in long]
+    share = len(others) // WORKERS + 1
+    items[:] = [
+        item
+        for worker in range(WORKERS)
+        for group in (*list(long.values())[worker::WORKERS], others[worker * share : (worker + 1) * share])
+        for item in group
+    ]
 
 
 @pytest.fixture(autouse=True)
