@@ -71,7 +71,8 @@ def _print(confirmation: Any) -> None:
     console = Console()
     console.print(table)
     verdict = "The gain is confirmed" if confirmation.is_confirmed else "No gain is confirmed: an interval includes 0"
-    console.print(f"{verdict}. A correct model would leave {1e3 * confirmation.noise_floor:.2f} mm ({confirmation.floor_source}).")
+    floor = f"{1e3 * confirmation.noise_floor:.2f} mm ({confirmation.floor_source})"
+    console.print(f"{verdict}. A correct model would leave {floor}.")
 
 
 def _format_gain(gain: Gain) -> list[str]:

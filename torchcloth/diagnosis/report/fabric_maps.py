@@ -66,9 +66,8 @@ def choose_misfit_limit(*linearisations: Linearisation) -> float:
     """Return an end of the colour bar [mm] that fits all linearisations."""
     sizes = [b.value[b.block == POINTS_BLOCK].abs().numpy() for result in linearisations for b in result.bins]
     size = np.concatenate(sizes)
-    return (
-        max(1e3 * float(np.quantile(size, SHOWN_QUANTILE)), MIN_MAP_COLOUR_LIMIT_MM) if len(size) else MIN_MAP_COLOUR_LIMIT_MM
-    )
+    shown_mm = 1e3 * float(np.quantile(size, SHOWN_QUANTILE)) if len(size) else 0.0
+    return max(shown_mm, MIN_MAP_COLOUR_LIMIT_MM)
 
 
 def _split_by_window(linearisation: Linearisation, episode: int, parts: int) -> dict[int, np.ndarray]:
