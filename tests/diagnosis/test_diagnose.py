@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import torch
 from helpers import sheet_episodes
+from helpers.schema_checks import check_written
 
 from torchcloth import recordings as rec
 from torchcloth.cli import main
@@ -141,6 +142,7 @@ def test_the_answer_is_written_and_its_model_is_a_layer(with_drag, tmp_path):
     recordings, answer = with_drag
     write_diagnosis(answer, recordings, tmp_path)
     content = json.loads((tmp_path / "diagnosis.json").read_text())
+    check_written(content, "diagnosis")
     assert {"verdict", "causes", "ruled_out", "unresolvable", "gain", "next_experiment", "model", "warnings"} <= set(
         content
     )

@@ -75,7 +75,7 @@ def test_the_point_itself_is_simulated_once(made, asked, monkeypatch, memory, ag
         simulated.append(world)
         return simulate(world, *arguments)
 
-    monkeypatch.setattr(World, "simulated", counted)
+    monkeypatch.setattr(World, "simulate", counted)
     later = linearise_hypotheses(known, model, setting, asked)
     assert len(simulated) == 4 + again
     assert torch.equal(later.bins[0].jacobian, linearise_hypotheses(known, model, setting, asked).bins[0].jacobian)

@@ -85,7 +85,7 @@ def test_what_a_fit_leaves_out_of_a_model_is_said_with_what_allows_for_it(made):
     clock = next(h for h in dx.list_hypotheses(base, [blank]) if h.name == "obs.clock")
     own = dx.Hypothesis("my.view", "m", 0.01, lambda w, a: w.with_observation_transform(lambda frames, e: frames))
     late, mine = describe_causes_outside_cloth(base.with_hypothesis(clock, -0.03).with_hypothesis(own, 0.02))
-    where = "of the model is of robot or camera and not in the cloth"
+    where = "of the model belongs to robot or camera, not to the cloth"
     assert late == f"obs.clock = -0.03 {where}: --nuisance clock allows for it"
     assert mine == f"my.view = 0.02 {where}: no option allows for it"
 
@@ -218,7 +218,7 @@ def test_the_gain_is_confirmed_on_what_was_not_seen(made, tmp_path, capsys):
     assert main(["confirm", *models, str(folder / "fast"), "--out", str(tmp_path)]) == 0
     assert "(the earlier one was replaced)" in " ".join(capsys.readouterr().out.split())
     found = json.loads((tmp_path / "confirmation.json").read_text())
-    assert found["confirmed"]
+    assert found["is_confirmed"]
     assert found["models"] == models
     assert found["episodes"] == [str(folder / "fast")]
     assert found["gain"]["rms_after"] < 0.4 * found["gain"]["rms_before"]
@@ -226,7 +226,7 @@ def test_the_gain_is_confirmed_on_what_was_not_seen(made, tmp_path, capsys):
     assert main(["confirm", *models[::-1], str(folder / "fast"), "--out", str(tmp_path / "b")]) == 2
     assert "a base model, then one with all its causes and more" in capsys.readouterr().err
     assert main(["confirm", models[0], models[0], str(folder / "fast"), "--out", str(tmp_path / "b")]) == 2
-    assert "where a diagnosis added nothing there is no gain to confirm" in capsys.readouterr().err
+    assert "a diagnosis that added no cause has no gain to confirm" in capsys.readouterr().err
     assert not (tmp_path / "b").exists()
     with pytest.raises(InvalidInput, match="'fast' twice"):
         dx.confirm(*models, 2 * [rec.read(folder / "fast")])
