@@ -184,7 +184,8 @@ def test_the_gain_is_told_with_its_intervals():
     assert third.endswith("Single points are farther off.")
     assert first.endswith("1.00 mm with the causes below. The noise floor of repetitions is 0.50 mm.")
     assert second == (
-        "The causes explain 97 % of what can be explained (95 %: 90 to 100 %), and gain 316 in log density (113 to 493)."
+        "The causes explain 97 % of what can be explained (95 %: 90 to 100 %), "
+        "and gain 316 in log density (113 to 493)."
     )
 
 

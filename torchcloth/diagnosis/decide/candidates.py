@@ -414,8 +414,7 @@ def accept(
         return False
 
     # Gate 9, second part. The amplitude is plausible; a fit that ended at zero is no cause. A cause does not stand
-    # alone
-    # because its rival is a little too large.
+    # alone because its rival is a little too large.
     max_typical = criteria.max_typical_of_rival if role == "rival" else criteria.max_typical
     return 0 < abs(amplitude) < max_typical * abs(typical)
 

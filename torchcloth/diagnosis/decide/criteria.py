@@ -23,8 +23,7 @@ the function that applies the gate and the class below that holds its numbers.
 11. It gains more than its permutations: ``permutation_test.run_permutation_test`` (``PermutationCriteria``).
 12. A further cause explains at least half of the remaining misfit: ``search.search`` (``SearchCriteria``).
 13. It survives backward elimination: ``backward_elimination.replace_by_implied``,
-``backward_elimination.drop_redundant``
-    (``CandidateCriteria``, ``SearchCriteria``).
+    ``backward_elimination.drop_redundant`` (``CandidateCriteria``, ``SearchCriteria``).
 14. All causes together explain enough of the misfit, otherwise all are dropped: ``search.search``
     (``SearchCriteria``, ``AdequacyCriteria``).
 15. No local force law without a cause predicts much better: ``search.replace_by_law`` (``ResidualLawCriteria``,
