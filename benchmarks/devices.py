@@ -1,7 +1,8 @@
 """What a CUDA device gains, and from how many scenes on: ``python -m torchcloth.benchmarks.devices``.
 
-The same cloths and motion on the fused engine, on the processor and on the device, and there by the reference's
-substeps, uses_cuda_graphs as graphs and launched one by one. It ends where one does not agree with the first.
+The fused engine runs the same cloths and motion on the processor and on the device. The reference's substeps run them
+on the device too, captured in CUDA graphs and launched one by one. A result that does not agree with the first ends the
+program.
 """
 
 from __future__ import annotations

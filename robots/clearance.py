@@ -55,7 +55,7 @@ class Gap(NamedTuple):
         return InvalidInput(
             f"{self.first} comes too near to {self.second} at t = {self.time:.3g} s",
             got=f"{self.distance:.3g} m" if self.distance > 0 else "they touch or cross",
-            expected=f"at min_distance {min_distance:g} m" if min_distance > 0 else "apart",
+            expected=f"at least {min_distance:g} m" if min_distance > 0 else "apart",
             remedy="turn the grippers less (roll), change heading, grips or path, or choose another orientation",
         )
 

@@ -49,7 +49,7 @@ def joint_motion_for_episode(recording: Recording, scene: Scene | None = None) -
 
     Raises:
         InvalidInput: the arms cannot do it; names the joint or the pair of solids that prevents it. Or ``scene`` has
-            unmatched arms than those that hold the cloth, or as ``scene_from_episode``.
+            other arms than those that hold the cloth, or as ``scene_from_episode``.
     """
     scene = scene_from_episode(recording) if scene is None else scene
     if scene is None:

@@ -339,7 +339,7 @@ def test_fields_have_a_value_for_each_triangle(folder, tmp_path, capsys):
 
 
 def test_an_interrupted_fit_goes_on_as_if_nothing_had_happened(folder, tmp_path, done):
-    """SIGINT after some work: the second run ends where an disable_autocast one does, to the last bit."""
+    """SIGINT after some work: the second run ends where an undisturbed one does, to the last bit."""
     out = tmp_path / "out"
     command = [*COMMAND, "identify", str(folder), "--out", str(out), "--start", "youngs_modulus=5e4", *QUICK]
     process = subprocess.Popen(

@@ -191,7 +191,7 @@ def changes():
 
 @pytest.mark.parametrize("change", changes(), ids=lambda f: f.__name__)
 def test_changes_between_calls_are_seen(change):
-    """Programs are intervals between calls, but never one that is no longer right."""
+    """Programs are cached between calls, but never one that is no longer right."""
     results = {}
     for engine in ("fused", "reference"):
         cloth = sheet(engine)

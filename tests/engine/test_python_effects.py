@@ -247,7 +247,7 @@ def test_a_force_on_triangles_may_be_that_of_all_scenes():
 
 
 class Mixing(Pull):
-    """By a plain matrix, whose axes nobody has messages."""
+    """Pull by a plain matrix that does not say how many axes it has."""
 
     def __init__(self, strength=1e-3):
         super().__init__(strength)

@@ -34,9 +34,11 @@ def at(renderer, point, frame=0):
     return renderer.pixels(frame)[row, column] / 255
 
 
-@pytest.mark.parametrize("look", [(0.0, 20.0), (130.0, 35.0), (0.0, 90.0), (70.0, -90.0), FROM_ABOVE, None])
-def test_the_camera_sees_everything(film, look):
-    camera = fit_camera(film, (400, 300), look)
+@pytest.mark.parametrize(
+    "eye_direction_deg", [(0.0, 20.0), (130.0, 35.0), (0.0, 90.0), (70.0, -90.0), FROM_ABOVE, None]
+)
+def test_the_camera_sees_everything(film, eye_direction_deg):
+    camera = fit_camera(film, (400, 300), eye_direction_deg)
     low, high = film.bounds
     corners = np.array(np.meshgrid(*zip(low, high, strict=True))).reshape(3, -1).T
     pixels, depth = camera.project(corners)
@@ -51,7 +53,7 @@ def test_the_camera_sees_everything(film, look):
 def test_straight_above_and_below_are_where_steep_ones_lead_to(film, end, tmp_path):
     cameras = [fit_camera(film, (400, 300), (30.0, elevation)) for elevation in (end, end * (1 - 1e-5))]
     np.testing.assert_allclose(cameras[0].T_world_camera, cameras[1].T_world_camera, rtol=0, atol=1e-4)
-    assert write_png(film, tmp_path / "a.png", look=(30.0, end)).is_file()
+    assert write_png(film, tmp_path / "a.png", eye_direction_deg=(30.0, end)).is_file()
 
 
 @pytest.mark.filterwarnings("error")

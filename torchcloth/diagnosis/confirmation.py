@@ -123,7 +123,7 @@ def confirm(
     scene = merge_scene(recordings)
     files = [read_model(path, scene) for path in (base, extended)]
     for path, file in zip((base, extended), files, strict=True):
-        check_same_cloth([replace(file.scene, path=Path(path)), scene], anywhere=True)
+        check_same_cloth([replace(file.scene, path=Path(path)), scene], any_scene=True)
     _check_is_extension(*(file.model for file in files))
     for recording in recordings:
         _check_not_fitted(recording, files)

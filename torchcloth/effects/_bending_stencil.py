@@ -143,7 +143,7 @@ def neighbour_differences(field: Tensor, index: Tensor) -> Tensor:
     return field.index_select(-2, index.flatten()).unflatten(-2, index.shape) - field.unsqueeze(-3)
 
 
-@lru_cache(maxsize=8)  # as many as curvature_stencils
+@lru_cache(maxsize=8)  # as many as ``curvature_stencils`` caches
 def _largest_eigenvalues(mesh: Mesh) -> tuple[float, float]:
     """Return the largest eigenvalues of bending and of slopes per unit of stiffness, over the vertices' areas."""
     neighbours, second, first = curvature_stencils(mesh)

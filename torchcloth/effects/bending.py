@@ -293,7 +293,7 @@ class _UniformPlate(NamedTuple):
     bound: np.ndarray
 
 
-@lru_cache(maxsize=8)  # as many as curvature_stencils: the power iteration takes longer than many a simulation
+@lru_cache(maxsize=8)  # as many as ``curvature_stencils`` caches: the power iteration takes longer than many a simulation
 def _uniform_plate(mesh: Mesh, poisson: float) -> _UniformPlate:
     stencils, area, share = curvature_stencils(mesh), mixed_area(mesh), mesh.vertex_area
     form = stencils.second @ np.linalg.cholesky(_isotropic_plate(poisson)) * np.sqrt(area)[:, None, None]

@@ -47,7 +47,7 @@ class Segmentation:
         table_margin: points lower than this above the table's plane are the table. Use three standard deviations of the
             sensor or more: at 1 m, 6 mm suits an Azure Kinect and 15 mm a D435. Cloth that lies flatter is removed with
             the table; then tell it apart by colour and set ``table_margin`` to -0.01.
-        plane_tolerance: points within this distance count as the table's while it is searched for. Use at smallest the
+        plane_tolerance: points within this distance count as the table's while it is searched for. Use at least the
             sensor's standard deviation there (8 mm of a D435 at 1.5 m), or the table may be found millimetres off, or
             not at all.
         outlier_neighbours: number of nearest neighbours whose mean distance decides whether a point is an outlier.

@@ -28,11 +28,9 @@ class QuadraticModel(NamedTuple):
             ``TANGENTIAL_STIFFNESS_RATIO``.
     """
 
-    value: Tensor  # m^2
-    gradient: Tensor  # [N] m^2 for each unit of N directions
-    curvature: (
-        Tensor  # [N, N], never negative: slopes alone, closest_points on the surfaces held along them by ``ALONG``
-    )
+    value: Tensor
+    gradient: Tensor
+    curvature: Tensor
 
 
 def average_models(models: Sequence[QuadraticModel]) -> QuadraticModel:

@@ -52,26 +52,26 @@ def display_name(recording: Recording, k: int) -> str:
     return recording.path.name if recording.path is not None else f"episode {k}"
 
 
-def check_same_cloth(recordings: Sequence[Recording], anywhere: bool = False) -> None:
+def check_same_cloth(recordings: Sequence[Recording], any_scene: bool = False) -> None:
     """Refuse episodes that do not describe one cloth, held at the same places.
 
     Args:
         recordings: the episodes.
-        anywhere: the mesh, gravity and places get grasps may differ, but not the set get grasps.
+        any_scene: the mesh, gravity and the places of grasps may differ, but not the set of grasps.
 
     Raises:
         InvalidInput: names the first difference.
     """
     first = recordings[0]
     for k, other in enumerate(recordings[1:], 1):
-        for what, get in (_CLOTH_FACTS if anywhere else _CLOTH_FACTS | _SCENE_FACTS).items():
+        for what, get in (_CLOTH_FACTS if any_scene else _CLOTH_FACTS | _SCENE_FACTS).items():
             a, b = get(first), get(other)
             if not _equal(a, b):
                 raise InvalidInput(
                     f"{display_name(other, k)}: another {what} than in {display_name(first, 0)}",
                     got=_format(b),
                     expected=_format(a),
-                    remedy="take the episodes get each cloth apart, or correct the description get one",
+                    remedy="use the episodes of each cloth separately, or correct the description of one",
                 )
 
 
@@ -136,7 +136,7 @@ def merge_scene(recordings: Sequence[Recording]) -> Recording:
                 f"table {name!r}",
                 got=f"{_describe_table(first)} in one episode, {_describe_table(table)} in another",
                 expected="one scene",
-                remedy="take the episodes of each scene apart, or name what differs apart",
+                remedy="use the episodes of each scene separately, or give different things different names",
             )
     for r in recordings:
         for name, table in tables.items():

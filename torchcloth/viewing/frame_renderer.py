@@ -30,7 +30,7 @@ class FrameRenderer:
     Args:
         film: what to show.
         size: (width, height) pixels.
-        look: (azimuth, elevation) of the eye [degrees]; None: chosen from the film.
+        eye_direction_deg: (azimuth, elevation) of the eye [degrees]; None: chosen from the film.
         camera: a camera of this size that another renderer made; None: one that fits the film.
 
     Raises:
@@ -41,7 +41,7 @@ class FrameRenderer:
         self,
         film: Film,
         size: tuple[int, int],
-        look: tuple[float, float] | None = None,
+        eye_direction_deg: tuple[float, float] | None = None,
         camera: DepthCamera | None = None,
     ) -> None:
         from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -60,7 +60,7 @@ class FrameRenderer:
         bar = COLOUR_BAR_WIDTH_FRACTION if film.has_values else 0.0
         self.axes = self.figure.add_axes((0, strip, 1 - bar, 1 - strip))
         inner = (round(width * (1 - bar)), round(height * (1 - strip)))
-        self.camera = camera or fit_camera(film, inner, look)
+        self.camera = camera or fit_camera(film, inner, eye_direction_deg)
         self.axes.set(xlim=(-0.5, inner[0] - 0.5), ylim=(inner[1] - 0.5, -0.5))
         self.axes.axis("off")
         self.ground = ground_planes(film)

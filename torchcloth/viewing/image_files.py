@@ -29,7 +29,7 @@ def write_gif(
     *,
     size: tuple[int, int] | None = None,
     rate: float = DEFAULT_GIF_RATE_HZ,
-    look: tuple[float, float] | None = None,
+    eye_direction_deg: tuple[float, float] | None = None,
     on_frame: Callable[[int, int], None] | None = None,
     left: Film | None = None,
 ) -> Path:
@@ -40,7 +40,7 @@ def write_gif(
         path: the file; it is written atomically.
         size: (width, height) pixels; None: 560 x 420.
         rate: most frames per second, up to 50.
-        look: (azimuth, elevation) of the eye [degrees]; None: chosen from the film.
+        eye_direction_deg: (azimuth, elevation) of the eye [degrees]; None: chosen from the film.
         on_frame: called with (frames done, all frames).
         left: another film of the same frames, shown on the left from the same eye with the same colours, for example
             the simulation before a fit.
@@ -57,11 +57,11 @@ def write_gif(
     if left is not None and not np.array_equal(left.times, film.times):
         raise InvalidInput("left", got=f"{len(left)} frames at other times", expected="the times of the film")
     film, left = film.limit_rate(rate), None if left is None else left.limit_rate(rate)
-    right = FrameRenderer(film, size or GIF_SIZE_PX, look)
+    right = FrameRenderer(film, size or GIF_SIZE_PX, eye_direction_deg)
     renderers = [right]
     if left is not None:
         left = replace(left, colour_limit=film.colour_limit)
-        renderers.insert(0, FrameRenderer(left, size or GIF_SIZE_PX, look, right.camera))
+        renderers.insert(0, FrameRenderer(left, size or GIF_SIZE_PX, eye_direction_deg, right.camera))
     palette = _palette(renderers)
     images = []
     for frame in range(len(film)):
@@ -88,7 +88,11 @@ def check_gif_rate(rate: float) -> None:
 
 
 def write_png(
-    film: Film, path: str | Path, *, size: tuple[int, int] | None = None, look: tuple[float, float] | None = None
+    film: Film,
+    path: str | Path,
+    *,
+    size: tuple[int, int] | None = None,
+    eye_direction_deg: tuple[float, float] | None = None,
 ) -> Path:
     """Write a PNG with four frames of the film, from the first to the last, side by side.
 
@@ -98,7 +102,7 @@ def write_png(
         film: what to show.
         path: the file; it is written atomically.
         size: (width, height) pixels of one frame with its colour bar; None: 480 x 420.
-        look: see ``write_gif``.
+        eye_direction_deg: see ``write_gif``.
 
     Returns:
         ``path``.
@@ -106,7 +110,7 @@ def write_png(
     from PIL import Image
 
     shown = np.unique(np.linspace(0, len(film) - 1, PNG_PANELS).round().astype(int))
-    renderer = FrameRenderer(film, size or PNG_PANEL_SIZE_PX, look)
+    renderer = FrameRenderer(film, size or PNG_PANEL_SIZE_PX, eye_direction_deg)
     panels = [renderer.pixels(int(frame), titled=frame == shown[0]) for frame in shown]
     row = np.concatenate([*(panel[:, : renderer.scene_width] for panel in panels[:-1]), panels[-1]], axis=1)
     with write_atomically(Path(path)) as file:

@@ -30,11 +30,11 @@ class Shading(NamedTuple):
 
     Attributes:
         ambient: fraction of ambient light, 0 to 1.
-        behind: brightness of back sides, 0 to 1.
+        back_side: brightness of back sides relative to front sides, 0 to 1.
     """
 
     ambient: float
-    behind: float
+    back_side: float
 
 
 PLAIN_SHADING = Shading(0.55, 0.82)
@@ -53,22 +53,24 @@ class Polygons(NamedTuple):
     colours: Array
 
 
-def fit_camera(film: Film, size: tuple[int, int], look: tuple[float, float] | None = None) -> DepthCamera:
+def fit_camera(film: Film, size: tuple[int, int], eye_direction_deg: tuple[float, float] | None = None) -> DepthCamera:
     """Return a camera whose image contains the film's bounds.
 
     Args:
-        film: what to look at.
+        film: film whose bounds must fit into the image.
         size: (width, height) pixels.
-        look: (azimuth, elevation) of the eye [degrees], azimuth from x to y; None: from the side of the first recorded
-            camera, else facing the arms.
+        eye_direction_deg: (azimuth, elevation) of the eye [degrees], azimuth from x to y; None: from the side of the
+            first recorded camera, else facing the arms.
     """
     width, height = size
     low, high = film.bounds
     arms = any(name.startswith("arms/") for name in film.solids)
     high = high + np.array([0, 0, ARM_HEIGHT_SHOWN_M if arms else 0])
     corners = np.array(np.meshgrid(*zip(low, high, strict=True))).reshape(3, -1).T
-    azimuth, elevation = np.radians(_direction(film, (low + high) / 2) if look is None else look)
-    towards = np.array([np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)])
+    if eye_direction_deg is None:
+        eye_direction_deg = _default_eye_direction(film, (low + high) / 2)
+    azimuth, elevation = np.radians(eye_direction_deg)
+    to_eye = np.array([np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)])
     level = np.array([np.cos(azimuth), np.sin(azimuth), 0.0])
     up = np.array([0.0, 0.0, 1.0]) if abs(np.cos(elevation)) > VERTICAL_VIEW_TOLERANCE else -np.sin(elevation) * level
     K = np.array(
@@ -78,19 +80,19 @@ def fit_camera(film: Film, size: tuple[int, int], look: tuple[float, float] | No
             [0, 0, 1],
         ]
     )
-    half = (1 - 2 * IMAGE_MARGIN_FRACTION) * np.array([width, height]) / 2 / (FOCAL_LENGTH_IMAGE_HEIGHTS * height)
+    half_size = (1 - 2 * IMAGE_MARGIN_FRACTION) * np.array([width, height]) / 2 / (FOCAL_LENGTH_IMAGE_HEIGHTS * height)
     target = (low + high) / 2
     for _ in range(4):  # the middle of the image depends slightly on the distance
-        axes = look_at(target + towards, target, up)[:3, :3]
+        axes = look_at(target + to_eye, target, up)[:3, :3]
         local = (corners - target) @ axes
-        distance = float((np.abs(local[:, :2]) / half - local[:, 2:]).max())
+        distance = float((np.abs(local[:, :2]) / half_size - local[:, 2:]).max())
         seen = local[:, :2] / (local[:, 2:] + distance)
         target = target + axes[:, :2] @ ((seen.max(0) + seen.min(0)) / 2 * distance)
-    return DepthCamera(width, height, K, look_at(target + distance * towards, target, up))
+    return DepthCamera(width, height, K, look_at(target + distance * to_eye, target, up))
 
 
-def _direction(film: Film, centre: Array) -> tuple[float, float]:
-    """Return (azimuth, elevation) [degrees] of the default view."""
+def _default_eye_direction(film: Film, centre: Array) -> tuple[float, float]:
+    """Return the default (azimuth, elevation) [degrees] of the eye."""
     for view in film.views.values():
         x, y, z = view.camera.T_world_camera[:3, 3] - centre
         elevation = np.clip(np.degrees(np.arctan2(z, np.hypot(x, y))), *ELEVATION_RANGE_DEG)
@@ -141,6 +143,7 @@ def project_polygons(film: Film, frame: int, camera: DepthCamera) -> Polygons:
 
 
 def _sheet(sheet: ClothSurface, frame: int, colour_limit: float, camera: DepthCamera) -> tuple[Array, Array, Array]:
+    """Return corners [F, 4, 2] px, colours [F, 3] and depths [F] m of a sheet's triangles, coloured by its values."""
     x, faces = sheet.vertices[frame].astype(float), sheet.faces
     normals = smoothed_normals(x, faces)
     if sheet.values is None:
@@ -150,7 +153,10 @@ def _sheet(sheet: ClothSurface, frame: int, colour_limit: float, camera: DepthCa
 
 
 def _outline(sheet: ClothSurface, frame: int, depth_bias: float, camera: DepthCamera) -> tuple[Array, Array, Array]:
-    """Return the boundary edges as polygons without area; all edges if there is no boundary."""
+    """Return corners [E, 4, 2] px, colours [E, 3] and depths [E] m of the boundary edges, as polygons without area.
+
+    A sheet without a boundary shows all its edges.
+    """
     pixels, depth = camera.project(sheet.vertices[frame].astype(float))
     edges = boundary_edges(sheet.faces)
     edges = edges if len(edges) else unique_edges(sheet.faces)
@@ -160,6 +166,7 @@ def _outline(sheet: ClothSurface, frame: int, depth_bias: float, camera: DepthCa
 
 
 def _solid(x: Array, faces: Array, colour: Array, camera: DepthCamera) -> tuple[Array, Array, Array]:
+    """Return corners [F, 4, 2] px, colours [F, 3] and depths [F] m of a solid's triangles that face the camera."""
     normal = face_normals(x, faces)
     outside = ((camera.T_world_camera[:3, 3] - x[faces[:, 0]]) * normal).sum(-1) > 0
     faces, normal = faces[outside], normal[outside]
@@ -172,20 +179,17 @@ def _shaded(
     """Return corners [F, 4, 2] px, colours [F, 3] and depths [F] m of the triangles in front of the camera."""
     pixels, depth = camera.project(x)
     corner_depth = depth[faces]
-    clip_to_camera = corner_depth.min(1) > NEAR_PLANE_M
-    faces, normal, colour = (
-        faces[clip_to_camera],
-        normal[clip_to_camera],
-        np.broadcast_to(colour, (len(clip_to_camera), 3))[clip_to_camera],
-    )
-    towards = camera.T_world_camera[:3, 3] - x[faces].mean(1)
-    back = (towards * face_normals(x, faces)).sum(-1) < 0
-    normal = np.where(back[:, None], -normal, normal)
+    is_in_front = corner_depth.min(1) > NEAR_PLANE_M
+    colour = np.broadcast_to(colour, (len(faces), 3))[is_in_front]
+    faces, normal = faces[is_in_front], normal[is_in_front]
+    to_eye = camera.T_world_camera[:3, 3] - x[faces].mean(1)
+    is_back_side = (to_eye * face_normals(x, faces)).sum(-1) < 0
+    normal = np.where(is_back_side[:, None], -normal, normal)
     light = camera.T_world_camera[:3, :3] @ (LIGHT_DIRECTION / np.linalg.norm(LIGHT_DIRECTION))
-    bright = shading.ambient + (1 - shading.ambient) * np.clip(normal @ light, 0, 1)
-    bright = np.where(back, shading.behind * bright, bright)
+    brightness = shading.ambient + (1 - shading.ambient) * np.clip(normal @ light, 0, 1)
+    brightness = np.where(is_back_side, shading.back_side * brightness, brightness)
     corners = pixels[faces][:, [0, 1, 2, 2]]
-    return corners, np.clip(colour / 255 * bright[:, None], 0, 1), corner_depth[clip_to_camera].mean(1)
+    return corners, np.clip(colour / 255 * brightness[:, None], 0, 1), corner_depth[is_in_front].mean(1)
 
 
 def _thin_out(points: Array, max_points: int) -> Array:
@@ -196,7 +200,7 @@ def _thin_out(points: Array, max_points: int) -> Array:
 def _dots(
     points: Array, colour: Array, depth_bias: float, camera: DepthCamera, size: float = 1.0
 ) -> tuple[Array, Array, Array]:
-    """Return points as small diamonds."""
+    """Return corners [N, 4, 2] px, colours [N, 3] and depths [N] m of points, drawn as small diamonds."""
     pixels, depth = camera.project(points)
     pixels, depth = pixels[depth > NEAR_PLANE_M], depth[depth > NEAR_PLANE_M]
     shape = size * POINT_RADIUS_IMAGE_HEIGHTS * camera.height * np.array([[1.0, 0], [0, 1], [-1, 0], [0, -1]])

@@ -69,7 +69,7 @@ def test_every_effect_of_the_engine_is_mapped_and_every_name_is_the_librarys():
 
 
 def test_amplitudes_are_the_librarys_typical_ones():
-    """A cause that is hidden below what the library looks for could never be case."""
+    """A cause that is hidden below what the library looks for could never be found."""
     typical = {h.effect: abs(h.typical) for h in list_known_hypotheses()}
     for name, mapping in SINGLE_EFFECTS.items():
         amplitude = abs(CATALOGUE[name].typical if mapping.typical is None else mapping.typical)
@@ -160,7 +160,7 @@ def recorded_placement(case, episode):
 
 @pytest.mark.parametrize("name", ["obs.extrinsic", "obs.rotation", "robot.base"])
 def test_a_false_pose_is_within_the_spread_of_true_ones(name):
-    """Where all true ones are quadrant, false ones can be read off."""
+    """If all true poses were alike, a false one could be read off."""
     nulls = [c for c in map(draw_case, range(300)) if c.family == "null"]
     effects = case_sampling._draw_effect(name, 1.0, np.random.default_rng(7), SINGLE_EFFECTS)
     usual, wrong = (
@@ -170,8 +170,8 @@ def test_a_false_pose_is_within_the_spread_of_true_ones(name):
     moved = wrong.mean(0) - usual.mean(0)
     assert np.abs(moved).max() > 1e-3
     assert (np.abs(moved) <= usual.std(0)).all()
-    assert len(np.unique(usual[:, 3].round(6))) == len(nulls)  # each has its effect camera
-    assert len(np.unique(usual[:, -3].round(6))) == len(usual)  # and each episode its effect start
+    assert len(np.unique(usual[:, 3].round(6))) == len(nulls)  # each case has its own camera
+    assert len(np.unique(usual[:, -3].round(6))) == len(usual)  # and each episode its own start
 
 
 @pytest.mark.parametrize("name", ["obs.clock", "air.drag_n"])

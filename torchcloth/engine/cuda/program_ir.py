@@ -59,7 +59,7 @@ class Call(NamedTuple):
     Attributes:
         kernel: number of the kernel.
         inputs: registers.
-        outputs: registers; results by ~register are add_impulses to it.
+        outputs: registers. ``~register`` means that the result is added to that register.
     """
 
     kernel: int
