@@ -43,8 +43,9 @@ DIRECTOR_PARAMETERS = ("contact_stiffness", "shear_stiffness", "cone")  # they a
 TENSION_CONVENTION = (
     "SI units. errors: force and lateral strain, computed minus measured, as a fraction of the largest reading of "
     "their table. std: standard error. It accounts for errors that are correlated along a curve, and for the scatter "
-    "between three or more tables at one angle. It does not account for a wrong law. identifiable: std is below a "
-    "quarter of the value (of a typical amplitude, where the amplitude is smaller)."
+    "between three or more tables at one angle. It does not account for a wrong law. identifiable: std is below 25 % "
+    "of the larger of the value and its typical size. It is also below half of the prior's standard deviation in the "
+    "unconstrained coordinate, unless the prior was measured."
 )
 
 

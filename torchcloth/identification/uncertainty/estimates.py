@@ -34,7 +34,10 @@ class Estimate:
         ci95: 95 % interval, in ``unit``.
         unit: of the parameter.
         initial: start value, in ``unit``.
-        identifiable: False when the data leave the parameter within its prior, whatever its value says.
+        identifiable: the standard error is below 25 % of the larger of the value and its typical size. It is also below
+            half of the prior's standard deviation in the unconstrained coordinate, unless the prior was measured
+            (``episodes.unknowns.IdentifiabilityCriteria``). No parameter is identifiable where the fit means nothing
+            (``withdraw_estimates``). A nuisance needs only the second condition.
         source: "data", "prior" (a measurement that the recording states), "derived", "not in the model",
             "held fixed" or "nuisance".
     """
