@@ -4,14 +4,18 @@
 
 1. kinematics of the triangles (``kinematics.surface``);
 2. internal variables: plastic set, internal friction, creases (``elasticity.update_memory``);
-3. membrane stress, and the reaction of compressed directors (``elasticity.membrane_stress``,
-   ``contact.self_contact.compute_director_forces``);
-4. forces on the vertices (``forces.vertex_forces``), stiff viscous ones in stages
-   (``viscous_stages.apply_viscous_stages``);
-5. velocities free of boundaries, with the contact between layers through the grid
+3. membrane stress (``elasticity.membrane_stress``). A director is a vector at each contact point that starts as the
+   surface normal and is compressed where layers press on each other. Its reaction is added to the stress
+   (``contact.self_contact.compute_director_forces``);
+4. mass of the air that moves along (``forces.compute_added_mass_ratio``);
+5. forces f on the vertices, without the stiff viscous ones (``forces.vertex_forces``);
+6. stiff viscous forces on the old velocities, in stages (``viscous_stages.apply_viscous_stages``);
+7. free velocities, as if there were neither contact nor boundaries: those of 6 plus dt f over the mass of cloth and
+   air. So 5 and 6 act in parallel, both from the state at the start of the substep;
+8. contact between layers, which changes these velocities through the grid
    (``contact.self_contact.contact_velocity_change``);
-6. boundaries: grasps and colliders, in order (``forces.apply_boundaries``);
-7. positions, and the directors that they carry along (``contact.self_contact.advance_directors``).
+9. boundaries: grasps and colliders, in order (``forces.apply_boundaries``);
+10. positions x + dt v, and the directors that they carry along (``contact.self_contact.advance_directors``).
 
 Elasticity and effects act on the vertices, which carry all the mass; the grid carries only contact. That split makes
 the solution converge when the step is halved: forces that pass through the grid are filtered at every step.
@@ -80,11 +84,11 @@ def step(
     added_mass_ratio = compute_added_mass_ratio(model, s, state.x)
     force = vertex_forces(model, state, s, memory, stress, compensation)
     v = apply_viscous_stages(model, state, s, memory, dt, prescribed, substep, added_mass_ratio)
-    free = v + dt * solve_added_mass(added_mass_ratio, force / model.mass)  # velocity free of contact and boundaries
+    free_v = v + dt * solve_added_mass(added_mass_ratio, force / model.mass)  # without contact and boundaries
     if grid is not None and contact_candidates is not None and directors is not None:
-        change = contact_velocity_change(model, grid, contact_candidates, directors, s, free, dt)
-        free = free + solve_added_mass(added_mass_ratio, change)
-    v, impulses = apply_boundaries(model, state.x, free, dt, prescribed, substep, added_mass_ratio)
+        change = contact_velocity_change(model, grid, contact_candidates, directors, s, free_v, dt)
+        free_v = free_v + solve_added_mass(added_mass_ratio, change)
+    v, impulses = apply_boundaries(model, state.x, free_v, dt, prescribed, substep, added_mass_ratio)
 
     x, d3 = state.x + dt * v, state.d3
     if grid is not None and contact_candidates is not None:

@@ -9,10 +9,11 @@ n applications of D reach dt c of 0.8 n^2, where n shorter steps would reach 2 n
 is. P is never negative, so elastic forces are left 2 of the 4 in 4 - 2 (1 - P) - omega^2 dt^2 > 0. With T_n(w_0) = 3 no
 more than half is left of what is damped fast (van der Houwen and Sommeijer 1980 leave 95 %).
 
-P acts on the velocities that the boundaries left, in parallel with the other forces and not after them. The other
-forces push the gripped vertices as well, and stages would carry that on to their neighbours. In every stage a gripped
-vertex keeps its prescribed velocity as seen by its neighbours. The force on it is accumulated separately, because it
-contributes to the gripper wrench.
+P acts on the velocities v at the start of the substep, which the boundaries left. The other forces f are computed from
+the same state, and both changes are added (``substep.step``): v_new = P(dt D) v + dt M^-1 f, with M the mass of cloth
+and air. The stages do not act on dt M^-1 f: these forces push the gripped vertices as well, and stages would carry that
+on to their neighbours. In every stage a gripped vertex keeps its prescribed velocity as seen by its neighbours. The
+force on it is accumulated separately, because it contributes to the gripper wrench.
 """
 
 from __future__ import annotations
