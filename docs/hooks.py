@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import importlib
+import json
 import re
 from pathlib import Path
 
@@ -125,11 +126,38 @@ def make_table(name: str) -> str:
     """Return a generated table as Markdown.
 
     Args:
-        name: "causes".
+        name: "causes", or a file with a JSON Schema, "plan.json"; "diagnosis.json#cause" is one of its definitions.
     """
     from torchcloth.diagnosis.causes.glossary import format_catalogue
     from torchcloth.diagnosis.causes.hypotheses import list_known_hypotheses
+    from torchcloth.schemas import load_schema
 
     if name == "causes":
         return format_catalogue(list_known_hypotheses())
-    raise ValueError(f"no table is called {name!r}")
+    file, _, definition = name.partition("#")
+    schema = load_schema(file.removesuffix(".json"))
+    node = schema["$defs"][definition] if definition else schema
+    stars = file == "episode.json"  # elsewhere the writer writes all keys
+    return "\n".join(["| key | meaning | unit, shape |", "|---|---|---|", *schema_rows(node, "", stars)])
+
+
+def schema_rows(node: dict, prefix: str, stars: bool) -> list[str]:
+    """Return a table row for each property of an object in a JSON Schema, and for those of objects in it.
+
+    Args:
+        node: the object.
+        prefix: of the keys.
+        stars: mark the required keys.
+    """
+    rows = []
+    for key, child in node["properties"].items():
+        star = " *" if stars and key in node.get("required", ()) else ""
+        values = [f"`{json.dumps(v)}`" for v in child.get("enum", [child["const"]] if "const" in child else [])]
+        meaning = "; ".join(filter(None, [child.get("description", ""), ", ".join(values)]))
+        unit = "; ".join(u for u in (child.get("unit", ""), child.get("shape", "")) if u and u != "-")
+        rows.append(f"| `{prefix}{key}`{star} | {meaning} | {unit} |".replace("|  |", "| |"))
+        inner = {"": child, ".NAME": child.get("additionalProperties"), "[]": child.get("items")}
+        for suffix, target in inner.items():
+            if isinstance(target, dict) and "properties" in target:
+                rows += schema_rows(target, f"{prefix}{key}{suffix}.", stars)
+    return rows

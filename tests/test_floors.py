@@ -16,7 +16,7 @@ COMPANIONS = ("benchmarks", "robots", "training")  # folders of their own, insta
 
 FLOORS = (
     ("errors",),
-    ("_utils",),
+    ("_utils", "schemas"),
     ("types", "parameters", "meshes"),
     ("materials", "effects", "boundaries", "recordings"),
     ("dynamics",),
@@ -39,7 +39,7 @@ FLOORS = (
 # Rooms that must know less than their floor allows.
 ONLY = {
     "robots": {"errors", "types", "recordings", "_utils"},  # tensors cross to the cloth, nothing else
-    "recordings": {"errors", "_utils", "types", "meshes"},  # an episode can be read without any physics
+    "recordings": {"errors", "_utils", "schemas", "types", "meshes"},  # an episode can be read without any physics
     "observe": {"errors", "meshes", "losses"},  # it sees where cloth is, and knows nothing of how it moves
 }
 

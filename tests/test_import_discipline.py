@@ -9,6 +9,7 @@ import pytest
 
 HEAVY = (
     "av",
+    "jsonschema",
     "lightning",
     "matplotlib",
     "mujoco",

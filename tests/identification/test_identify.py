@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from helpers.schema_checks import check_written
 from helpers.twins import THICKNESS, TRUE, at, first, twin
 
 import torchcloth as tc
@@ -87,6 +88,7 @@ def test_the_result_is_the_promised_json(fitted, tmp_path):
         raise AssertionError(f"{constant} is not JSON")
 
     content = json.loads(path.read_text(), parse_constant=refuse)
+    check_written(content, "identification")
     assert set(content) >= {"parameters", "fit", "convention", "warnings"}
     for name, p in content["parameters"].items():
         assert set(p) >= {"value", "std", "ci95", "unit", "initial", "identifiable"}, name

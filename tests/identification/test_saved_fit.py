@@ -158,7 +158,7 @@ DAMAGE = {
     "a number of 400 digits": (put("model", "values", "youngs_modulus", value=10**400), "youngs_modulus 1000.*0000 wh"),
     "a fabric of nothing": (put("model", "values", "youngs_modulus", value=1e40), "youngs_modulus 1e.40, beyond every"),
     "a number that is none": (put("model", "values", "youngs_modulus", value=True), "youngs_modulus True where"),
-    "contact spacing a word": (put("model", "contact", value={**CONTACT, "spacing": "x"}), "contact spacing 'x' where"),
+    "contact spacing a word": (put("model", "contact", value={**CONTACT, "spacing": "x"}), "contact.spacing 'x' where"),
     "contact without width": (put("model", "contact", value={**CONTACT, "spacing": 0}), "contact spacing 0 where"),
     "contact of halves": (put("model", "contact", value={**CONTACT, "subdivisions": 2.5}), "subdivisions"),
     "contact that plays": (

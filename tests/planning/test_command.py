@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import torch
 from helpers.planning_scenes import by_arm, by_hand, cloth_of
+from helpers.schema_checks import check_written
 
 from torchcloth import recordings as rec
 from torchcloth.cli import main
@@ -54,6 +55,7 @@ def test_writes_what_was_planned(folder, goal, tmp_path, capsys):
     out = tmp_path / "out"
     assert main(["plan", str(folder), "--goal", str(goal), "--out", str(out), *OPTIONS]) == 0
     words = json.loads((out / "plan.json").read_text())
+    check_written(words, "plan")
     assert words["distance"]["after"][0] < 0.3 * words["distance"]["before"][0]
     assert words["nearest_limit"]["limit"].endswith("of arm")
     assert words["warnings"] == []

@@ -12,6 +12,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from helpers.schema_checks import check_written
 from PIL import Image
 
 import torchcloth as tc
@@ -97,6 +98,7 @@ def test_a_sewn_garment_is_an_episode(assert_same, tmp_path):
     back = rec.read(rec.write(whole, tmp_path / "ep"))
     assert_same(whole, back)
     stored = json.loads((tmp_path / "ep" / "episode.json").read_text())
+    check_written(stored, "episode")
     assert stored["grasps"] == {"g": {"vertices": holding.tolist()}}
     again = tc.meshes.Mesh.build(back.cloth.vertices, back.cloth.faces, back.cloth.uv)
     np.testing.assert_array_equal(again.rest, mesh.rest)

@@ -23,6 +23,7 @@ from ...parameters import PhysicalParameter
 from ...recordings import Recording
 from ...recordings.consistency import merge_scene
 from ...recordings.fingerprints import fingerprint, same_episode
+from ...schemas import check_structure
 from ..residuals.metrics import distance_metrics
 from ..result import IDENTIFICATION_FILE_NAME, IDENTIFICATION_SCHEMA, Identification, nan_to_none
 from .result_files import check_number, read_result
@@ -209,6 +210,7 @@ def _parse_contact(**content: Any) -> Contact:
 
 
 def _parse_fit(content: dict[str, Any]) -> SavedFit:
+    check_structure(content, "identification")
     model, parameters, correlation = (content[key] for key in ("model", "parameters", "correlation"))
     matrix = np.array([[check_number(row[name], -1.0) for name in correlation] for row in correlation.values()])
     if not len(matrix):
