@@ -6,7 +6,6 @@ from collections.abc import Collection
 
 import numpy as np
 import torch
-from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from torchcloth.errors import RecordingError
@@ -114,6 +113,8 @@ def _closed(joints: JointMotion) -> Tensor:
 
 def _poses(position: np.ndarray, quat_wxyz: np.ndarray) -> Tensor:
     """[K, 4, 4] from positions [K, 3] m and unit quaternions [K, 4]."""
+    from scipy.spatial.transform import Rotation
+
     pose = torch.eye(4, dtype=torch.float64).repeat(len(position), 1, 1)
     pose[:, :3, :3] = _tensor(Rotation.from_quat(np.roll(quat_wxyz, -1, axis=-1)).as_matrix())
     pose[:, :3, 3] = _tensor(position)
@@ -122,6 +123,8 @@ def _poses(position: np.ndarray, quat_wxyz: np.ndarray) -> Tensor:
 
 def _quaternions(rotation: np.ndarray) -> np.ndarray:
     """[K, 4] wxyz of rotations [K, 3, 3], without jumps of sign."""
+    from scipy.spatial.transform import Rotation
+
     q = np.roll(Rotation.from_matrix(rotation).as_quat(), 1, axis=-1)
     flips = np.cumprod(np.where((q[1:] * q[:-1]).sum(-1) < 0, -1.0, 1.0))
     return q * np.concatenate([[1.0], flips])[:, None] * np.sign(q[0, np.abs(q[0]).argmax()])

@@ -6,7 +6,6 @@ import math
 from collections.abc import Sequence
 
 import torch
-from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from torchcloth.errors import InvalidInput
@@ -54,6 +53,8 @@ def twist(pose: Tensor, target: Tensor) -> Tensor:
 
     No gradient flows through its rotation.
     """
+    from scipy.spatial.transform import Rotation
+
     turn = (target[..., :3, :3] @ pose[..., :3, :3].mT).detach()
     rotation = Rotation.from_matrix(turn.reshape(-1, 3, 3).cpu().double().numpy()).as_rotvec()
     rotation = torch.as_tensor(rotation).to(turn).reshape(turn.shape[:-1])

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import torch
-from scipy.interpolate import CubicSpline
 from torch import Tensor
 
 
@@ -18,6 +17,8 @@ class ClampedSpline:
     """
 
     def __init__(self, t: Tensor, q: Tensor) -> None:
+        from scipy.interpolate import CubicSpline
+
         self.t, self.q = t, q.detach()
         self._curve = CubicSpline(t.detach().cpu().numpy(), self.q.cpu().numpy(), bc_type="clamped")
 
