@@ -27,7 +27,7 @@ def test_there_are_notebooks():
 @pytest.mark.parametrize(
     "path",
     [
-        pytest.param(path, id=path.stem, marks=pytest.mark.slow if path.stem.startswith("what_") else ())
+        pytest.param(path, id=path.stem, marks=pytest.mark.slow if path.stem.startswith("02_") else ())
         for path in NOTEBOOKS
     ],
 )  # the second notebook diagnoses for minutes
