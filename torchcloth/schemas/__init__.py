@@ -28,7 +28,7 @@ def load_schema(name: str) -> dict[str, Any]:
     Args:
         name: one of ``SCHEMA_NAMES``.
     """
-    return json.loads((resources.files(__package__) / f"{name}.schema.json").read_text(encoding="utf-8"))
+    return json.loads((resources.files(__name__) / f"{name}.schema.json").read_text(encoding="utf-8"))
 
 
 def check_structure(content: Any, name: str) -> None:
