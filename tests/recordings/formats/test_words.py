@@ -11,7 +11,7 @@ from helpers import foreign_formats
 from torchcloth import recordings as rec
 from torchcloth.errors import RecordingError
 from torchcloth.recordings import formats
-from torchcloth.recordings.formats import sidecar_schema
+from torchcloth.recordings.formats import scene_file_keys
 
 GRASP = {"uv": [[0.0, 0.2]], "radius": 0.012}
 PLANE = {"point": [0, 0, 0], "normal": [0, 0, 1]}
@@ -61,7 +61,7 @@ def test_notes_of_ones_own_are_kept(tum, tmp_path):
 def test_every_word_of_an_episode_is_known(tum, tmp_path):
     """What torchcloth itself writes, it also takes as a scene."""
     written = rec.write(formats.read(tum.path, scene=scene(tmp_path, tum.scene)), tmp_path / "ep")
-    sidecar_schema.check_keys(json.loads((written / "episode.json").read_text()), "episode.json")
+    scene_file_keys.check_keys(json.loads((written / "episode.json").read_text()), "episode.json")
 
 
 def test_names_of_cameras_must_match(tum, tmp_path):

@@ -12,7 +12,7 @@ TUM RGB-D folders             ``tum``
 ============================  ==========================================
 
 Each importer is a module that defines an ``Importer``. What only
-the user knows is in a sidecar file with the keys of episode.json; see ``sidecar``. Images are decoded when they are
+the user knows is in a scene file with the keys of episode.json; see ``scene_file``. Images are decoded when they are
 written.
 """
 
@@ -28,7 +28,7 @@ from .lerobot import LEROBOT_IMPORTER, LEROBOT_NAME
 from .mcap_writer import write as write_mcap
 from .redwood import REDWOOD_IMPORTER
 from .ros2 import ROS2_IMPORTER
-from .sidecar import Sidecar
+from .scene_file import SceneFile
 from .tum import TUM_IMPORTER
 
 IMPORTERS = (ROS2_IMPORTER, LEROBOT_IMPORTER, REDWOOD_IMPORTER, TUM_IMPORTER, KINECT_IMPORTER)
@@ -43,7 +43,7 @@ FOREIGN_SIGNATURES = {  # of files that are often confused with a recording
     b"\x89HDF": "an HDF5 file",
 }
 
-__all__ = ["FORMAT_NAMES", "Sidecar", "detect_format", "read", "write_mcap"]
+__all__ = ["FORMAT_NAMES", "SceneFile", "detect_format", "read", "write_mcap"]
 
 
 def detect_format(path: str | Path) -> str:
@@ -96,9 +96,9 @@ def read(
         if scene is not None:
             raise RecordingError(f"{path} is an episode", got="a scene", remedy="edit its episode.json instead")
         return reading.read(path, with_truth=True)
-    sidecar = Sidecar.read(None if scene is None else Path(scene))
+    scene_file = SceneFile.read(None if scene is None else Path(scene))
     importer = next(importer for importer in IMPORTERS if detected == importer.name)
-    return sidecar.complete_recording(importer.read(path, sidecar, episode), path)
+    return scene_file.complete_recording(importer.read(path, scene_file, episode), path)
 
 
 def _content(path: Path) -> str:

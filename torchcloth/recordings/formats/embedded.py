@@ -14,13 +14,13 @@ from .. import streams
 from ..files import Folder
 from .bag import Bag
 from .imported import Imported, report_damage
-from .sidecar import Sidecar
+from .scene_file import SceneFile
 
 SCENE_TOPIC, FILES_TOPIC = "/torchcloth/scene", "/torchcloth/files"
 EXTRA_ARRAYS_FILE = "extra.npz"
 
 
-def adopt_sidecar(scene: Sidecar, bag: Bag) -> None:
+def adopt_scene_file(scene: SceneFile, bag: Bag) -> None:
     """Take the scene that the bag carries.
 
     Raises:
@@ -39,7 +39,7 @@ def adopt_sidecar(scene: Sidecar, bag: Bag) -> None:
     scene.folder = Folder(bag.path, in_memory=files)
 
 
-def restore_files(imported: Imported, scene: Sidecar) -> Imported:
+def restore_files(imported: Imported, scene: SceneFile) -> Imported:
     """Add the streams that lie in small files."""
     folder = scene.folder
     if EXTRA_ARRAYS_FILE in folder.in_memory:

@@ -40,7 +40,7 @@ class ImportedCamera:
 
 @dataclass
 class Imported:
-    """The content of a file of another format; the sidecar adds the rest.
+    """The content of a file of another format; the scene file adds the rest.
 
     Attributes:
         motion: by name, as the groups of motion.npz.
@@ -64,7 +64,7 @@ class Importer(NamedTuple):
         name: of the format.
         title: of the format, for people.
         matches: whether a path is of this format, by its content.
-        read: reads (path, sidecar, number of the episode or None).
+        read: reads (path, scene file, number of the episode or None).
     """
 
     name: str

@@ -26,7 +26,7 @@ from ..checks import Fields
 from ..images import ImageKind, ImageSource, ImageStream
 from . import matroska
 from .imported import Imported, ImportedCamera, Importer, pair_frames, reject_unknown_keys, report_damage, to_seconds
-from .sidecar import Sidecar
+from .scene_file import SceneFile
 from .video import VideoFrames, open_video, read_packet_times, reject_logged_errors
 
 KINECT_NAME = "kinect"
@@ -69,12 +69,12 @@ def matches(path: Path) -> bool:
         return file.read(4) == matroska.MATROSKA_SIGNATURE
 
 
-def read(path: Path, scene: Sidecar, episode: int | None) -> Imported:
+def read(path: Path, scene: SceneFile, episode: int | None) -> Imported:
     """Read the tracks and the calibration; images are decoded when they are written.
 
     Args:
         path: the .mkv file.
-        scene: the sidecar.
+        scene: the scene file.
         episode: unused; a file holds one episode.
 
     Raises:

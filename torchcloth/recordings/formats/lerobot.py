@@ -29,7 +29,7 @@ from ..checks import Fields
 from ..files import Folder
 from ..images import ImageStream
 from .imported import NANOSECONDS_PER_SECOND, Imported, ImportedCamera, Importer, reject_unknown_keys, report_damage
-from .sidecar import Sidecar
+from .scene_file import SceneFile
 from .video import VideoFrames
 
 LEROBOT_NAME = "lerobot"
@@ -50,12 +50,12 @@ def matches(path: Path) -> bool:
     return (path / INFO_FILE).is_file()
 
 
-def read(path: Path, scene: Sidecar, episode: int | None) -> Imported:
+def read(path: Path, scene: SceneFile, episode: int | None) -> Imported:
     """Read one episode; video is decoded when it is written.
 
     Args:
         path: folder of the data set.
-        scene: the sidecar with ``source``.
+        scene: the scene file with ``source``.
         episode: which one; None if there is only one.
 
     Raises:

@@ -30,7 +30,7 @@ from ..types import Camera, PointClouds, Recording
 from . import embedded, mcap_checksums, ros2
 from .imported import NANOSECONDS_PER_SECOND
 from .ros2_topics import WORLD_FRAMES
-from .sidecar import Sidecar
+from .scene_file import SceneFile
 
 WriteEvent = tuple[int, Callable[[], None]]  # ns, and what writes the message of that time
 FINGER_JOINT_NAME = "finger_width"
@@ -78,7 +78,7 @@ def write(
 
 def _read_back(file: Path, target: Path) -> None:
     """Refuse a file that cannot be read again, under its final name."""
-    scene = Sidecar.read(None)
+    scene = SceneFile.read(None)
     try:
         scene.complete_recording(ros2.read(file, scene, None), target)
     except RecordingError as error:

@@ -36,7 +36,7 @@ from .imported import (
     require_fixed_pose,
     to_seconds,
 )
-from .sidecar import Sidecar
+from .scene_file import SceneFile
 
 REDWOOD_NAME = "redwood"
 REDWOOD_TITLE = "Open3D/Redwood RGB-D folder"
@@ -55,12 +55,12 @@ def matches(path: Path) -> bool:
     return (path / "depth").is_dir() and color and any((path / name).is_file() for name in INTRINSIC_FILES)
 
 
-def read(path: Path, scene: Sidecar, episode: int | None) -> Imported:
+def read(path: Path, scene: SceneFile, episode: int | None) -> Imported:
     """Read the folder; the images are checked when they are copied.
 
     Args:
         path: the folder.
-        scene: the sidecar.
+        scene: the scene file.
         episode: unused; a folder holds one episode.
 
     Raises:

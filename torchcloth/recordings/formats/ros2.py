@@ -34,7 +34,7 @@ from .bag import Bag, is_bag
 from .imported import Imported, Importer, reject_unknown_keys
 from .ros2_cameras import CameraTopics
 from .ros2_topics import CloudTopic, MotionTopics
-from .sidecar import Sidecar
+from .scene_file import SceneFile
 
 ROS2_NAME = "ros2"
 ROS2_TITLE = "ROS 2 bag (rosbag2 folder, .mcap, .db3)"
@@ -47,12 +47,12 @@ def matches(path: Path) -> bool:
     return is_bag(path)
 
 
-def read(path: Path, scene: Sidecar, episode: int | None) -> Imported:
+def read(path: Path, scene: SceneFile, episode: int | None) -> Imported:
     """Read a bag; images are decoded when they are written.
 
     Args:
         path: a rosbag2 folder, or a .mcap or .db3 file.
-        scene: the sidecar with ``source``.
+        scene: the scene file with ``source``.
         episode: unused; a bag holds one episode.
 
     Raises:
@@ -60,7 +60,7 @@ def read(path: Path, scene: Sidecar, episode: int | None) -> Imported:
     """
     bag = Bag(path)
     if embedded.SCENE_TOPIC in bag.types:
-        embedded.adopt_sidecar(scene, bag)
+        embedded.adopt_scene_file(scene, bag)
     source = scene.source
     if not source.remaining:
         got = ", ".join(f"{topic} ({kind.rpartition('/')[2]})" for topic, kind in sorted(bag.types.items()))

@@ -10,7 +10,7 @@ from ..checks import Fields
 from . import ros2_messages
 from .bag import Bag, BagMessage
 from .imported import reject_unknown_keys, to_pose_matrices, to_quaternions, to_seconds
-from .sidecar import Sidecar
+from .scene_file import SceneFile
 
 WORLD_FRAMES = ("world", "map")
 MAX_WRENCH_DELAY_S = 0.1  # wrenches may begin this much after the first knot, or end this much before the last
@@ -30,7 +30,7 @@ def require_topic(fields: Fields, key: str, bag: Bag, *kinds: str) -> str:
     return name
 
 
-def frame_pose_of(fields: Fields, scene: Sidecar) -> np.ndarray | None:
+def frame_pose_of(fields: Fields, scene: SceneFile) -> np.ndarray | None:
     """Return the pose of the frame that the mapping names; None if it names none."""
     frame = fields.optional(fields.text, "frame")
     return None if frame is None else scene.frame_pose(frame)
@@ -58,7 +58,7 @@ def check_world_frame(message: BagMessage, frame: np.ndarray | None, remedy: str
 class MotionTopics:
     """The topics of one gripper or arm: a pose or joint states, and what belongs to them."""
 
-    def __init__(self, fields: Fields, bag: Bag, scene: Sidecar) -> None:
+    def __init__(self, fields: Fields, bag: Bag, scene: SceneFile) -> None:
         self.place = fields.place
         self.pose = require_topic(fields, "pose", bag, "PoseStamped") if fields.has("pose") else None
         self.frame = frame_pose_of(fields, scene)
@@ -227,7 +227,7 @@ class ClosedTopic:
 class CloudTopic:
     """Reader of a topic with segmented cloth points."""
 
-    def __init__(self, fields: Fields, bag: Bag, scene: Sidecar) -> None:
+    def __init__(self, fields: Fields, bag: Bag, scene: SceneFile) -> None:
         self.place = fields.place
         self.topic = require_topic(fields, "topic", bag, "PointCloud2")
         self.frame = frame_pose_of(fields, scene)

@@ -37,7 +37,7 @@ from .imported import (
     to_pose_matrices,
     to_seconds,
 )
-from .sidecar import Sidecar
+from .scene_file import SceneFile
 
 TUM_NAME = "tum"
 TUM_TITLE = "TUM RGB-D folder"
@@ -53,12 +53,12 @@ def matches(path: Path) -> bool:
     return all((path / file).is_file() for file in IMAGE_LIST_FILES.values())
 
 
-def read(path: Path, scene: Sidecar, episode: int | None) -> Imported:
+def read(path: Path, scene: SceneFile, episode: int | None) -> Imported:
     """Read the folder; the images are checked when they are copied.
 
     Args:
         path: the folder.
-        scene: the sidecar.
+        scene: the scene file.
         episode: unused; a folder holds one episode.
 
     Raises:

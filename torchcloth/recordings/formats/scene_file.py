@@ -1,4 +1,4 @@
-"""The sidecar file (scene): what only the user knows of a recording, in the keys of episode.json."""
+"""The scene file: what only the user knows of a recording, in the keys of episode.json."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from ..checks import Fields
 from ..files import Folder
 from ..images import ImageKind, ImageStream
 from ..types import Recording
-from . import sidecar_schema
+from . import scene_file_keys
 from .imported import Imported, ImportedCamera
 
 CLOTH_EXAMPLE = '"cloth": {"sheet": {"width": 0.3, "height": 0.3}, "areal_density": 0.15, "thickness": 0.0005}'
@@ -23,8 +23,8 @@ CAMERA_POSE_EXAMPLE = '"T_world_camera": [[1,0,0,0],[0,1,0,0],[0,0,1,0],[0,0,0,1
 CALIBRATION_TOLERANCE = 1e-3  # relative; two copies of one calibration differ by rounding only
 
 
-class Sidecar:
-    """Content of the sidecar file; without one it is empty, and messages say what to write.
+class SceneFile:
+    """Content of the scene file; without one it is empty, and messages say what to write.
 
     Besides the keys of episode.json it may contain ``source``: what each topic, column or track is.
     """
@@ -33,12 +33,12 @@ class Sidecar:
         self.values, self.folder, self.name = values, folder, name
 
     @classmethod
-    def read(cls, path: Path | None) -> Sidecar:
-        """Read a JSON file; None gives an empty sidecar."""
+    def read(cls, path: Path | None) -> SceneFile:
+        """Read a JSON file; None gives an empty scene file."""
         if path is None:
             return cls({}, Folder(Path()), "the scene (--scene FILE)")
         values = Folder(path.parent).read_json(path.name).remaining
-        sidecar_schema.check_keys(values, str(path))
+        scene_file_keys.check_keys(values, str(path))
         return cls(values, Folder(path.parent), str(path))
 
     @property
@@ -79,7 +79,7 @@ class Sidecar:
         return entry if isinstance(entry, dict) else {}
 
     def complete_recording(self, imported: Imported, path: Path) -> Recording:
-        """Merge the imported file and the sidecar into one checked recording; if both give a value, they must agree."""
+        """Merge the imported file and the scene file into one checked recording; values that both give must agree."""
         values = {
             key: value for key, value in self.values.items() if key not in ("source", "schema", "format", "version")
         }
@@ -113,7 +113,7 @@ class Sidecar:
                 raise RecordingError(what, expected=expected, remedy=remedy)
 
     def _require(self, values: dict[str, Any], imported: Imported, path: Path) -> None:
-        """List in one message everything that neither the file nor the sidecar contains."""
+        """List in one message everything that neither the file nor the scene file contains."""
         missing_entries = [
             text for key, text in (("cloth", CLOTH_EXAMPLE), ("provenance", PROVENANCE_EXAMPLE)) if not values.get(key)
         ]
@@ -132,13 +132,13 @@ class Sidecar:
             raise RecordingError(what, expected=f"{self.name} with {{{', '.join(missing_entries)}}}", remedy=remedy)
 
     def _missing_camera_entries(self, name: str, camera: ImportedCamera) -> list[str]:
-        """What neither the file nor the sidecar contains of a camera."""
+        """What neither the file nor the scene file contains of a camera."""
         entries = {**camera.calibration, **self.camera_entry(name)}
         pose = [] if camera.placed_by or "T_world_camera" in entries else [CAMERA_POSE_EXAMPLE]
         return pose if "K" in entries else [CAMERA_MATRIX_EXAMPLE, *pose]
 
     def _cameras(self, imported: dict[str, ImportedCamera]) -> dict[str, Any]:
-        """Cameras of the sidecar and of the file; the file wins, and a contradiction is refused."""
+        """Cameras of the scene file and of the file; the file wins, and a contradiction is refused."""
         cameras = self.values.get("cameras") or {}
         merged = dict(cameras) if isinstance(cameras, dict) else {}
         for name, camera in imported.items():

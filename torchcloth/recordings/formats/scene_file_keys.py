@@ -1,4 +1,4 @@
-"""Known keys of a sidecar file, from the schema of episode.json.
+"""Known keys of a scene file, from the schema of episode.json.
 
 A typo is refused here, whereas episode.json preserves unknown keys.
 """
@@ -11,16 +11,16 @@ from ...errors import RecordingError
 from ...schemas import list_keys
 
 FREE_KEYS = ("notes", "extra")  # and x_...: preserved in the episode
-SOURCE_KEY = "source"  # of a sidecar only: which topics, columns and files are what
+SOURCE_KEY = "source"  # of a scene file only: which topics, columns and files are what
 OBJECT_PATHS = ("cloth", "cloth.sheet", "cloth.nominal", "observation_noise", "split", "air")
 NAMED_GROUPS = ("grasps", "robots", "cameras", "colliders")  # of objects with names that the user chooses
 
 
 def check_keys(values: dict[str, Any], name: str) -> None:
-    """Refuse unknown keys of a sidecar; values of a wrong type are left to whoever reads them.
+    """Refuse unknown keys of a scene file; values of a wrong type are left to whoever reads them.
 
     Args:
-        values: the sidecar.
+        values: the scene file.
         name: of its file, for messages.
 
     Raises:
