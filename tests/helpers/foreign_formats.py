@@ -209,7 +209,7 @@ def ros2(folder: Path, storage: str = "mcap", *, seal: bool = False) -> Foreign:
             [(ns, make(kind, header(ns, "lens"), "jpeg", c)) for ns, c in zip(stamps, files, strict=False)],
         )
     if storage == "mcap" and seal:
-        mcap_checksums.seal(root / f"{root.name}.mcap")
+        mcap_checksums.write_checksums(root / f"{root.name}.mcap")
     joint_map = {"topic": "/joint_states", "names": [f"j{k}" for k in range(7)], "width": "finger"}
     left = {"pose": "/left/pose", "closed": "/closed", "wrench": "/left/ft", "wrench_frame": "world"}
     scene = {

@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 import torch
 from torch import Tensor
 
-from torchcloth.identification.estimators.levenberg_marquardt import WINDOW, Linearised, Problem, minimise
+from torchcloth.identification.estimators.levenberg_marquardt import DEFAULT_NOISE_MODEL, Linearised, Problem, minimise
 
 FRAMES, PATCHES, EACH = 40, 16, 3  # rows: 40 frames of 16 patches of 3 points
 SIGMA = 1e-3  # m
@@ -41,8 +41,8 @@ class Toy:
             clip=lambda raw: raw,
             prior_mean=mean,
             prior_std=std,
-            longest=torch.ones_like(mean),
-            noise=None,
+            max_step=torch.ones_like(mean),
+            noise_floor=None,
         )
 
     def _linearise(self, raw: Tensor) -> Linearised:
@@ -80,7 +80,7 @@ def noise(generator: torch.Generator, shared: float, frames: int = FRAMES) -> Te
     The windows begin two frames off those that the solver counts in: real errors do not know them.
     """
     frame, patch = layout(frames)
-    window = (frame + 2) // WINDOW
+    window = (frame + 2) // DEFAULT_NOISE_MODEL.frames_per_time_block
     common = torch.randn(int(window.max()) + 1, PATCHES, generator=generator, dtype=torch.float64)
     alone = torch.randn(len(frame), generator=generator, dtype=torch.float64)
     return SIGMA * (alone + shared * common[window, patch])

@@ -1,6 +1,7 @@
-"""Makes the files in tests/recordings/formats/mcap by the MCAP project's own writer (``pip install mcap mcap-ros2-support``).
+"""Makes the files in tests/recordings/formats/mcap by the MCAP project's own writer.
 
-Five poses of a gripper, in chunks and with checksums as ROS 2 recorders leave them. Ours; CC0, free of any rights.
+The writer comes with ``pip install mcap mcap-ros2-support``. The files hold five poses of a gripper, in chunks and
+with checksums as ROS 2 recorders leave them. Ours; CC0, free of any rights.
 """
 
 from __future__ import annotations

@@ -10,10 +10,10 @@ import torch
 
 import torchcloth as tc
 from torchcloth import recordings as rec
-from torchcloth.diagnosis import World, base_model
+from torchcloth.diagnosis import World, build_base_model
 from torchcloth.episodes.observed import Episode
 from torchcloth.episodes.observed import build_episode as tensors
-from torchcloth.episodes.pattern_interpolation import interpolation_weights, interpolate_on_pattern
+from torchcloth.episodes.pattern_interpolation import interpolate_on_pattern, interpolation_weights
 from torchcloth.episodes.replay import Frames
 
 SIDE = 0.2  # m
@@ -78,11 +78,14 @@ def _at(place: tuple[float, float, float]) -> np.ndarray:
 
 
 def recorded(
-    motion: str, change: Callable[[World], World], seed: int, play: Callable[[World, Episode], Frames] = World.frames
+    motion: str,
+    change: Callable[[World], World],
+    seed: int,
+    play: Callable[[World, Episode], Frames] = World.simulate_observed,
 ) -> rec.Recording:
     """What a noisy sensor has of a world that is changed, played on a finer mesh; the first shape is settled."""
     blank, rng = episode(motion, TRUTH, (FRAMES - 1) / RATE + 0.01), np.random.default_rng(seed)
-    plain = base_model(blank).world()
+    plain = build_base_model(blank).build_world()
     world, even = change(plain), np.asarray(blank.cloth.uv)
     with torch.no_grad():
         data = tensors(world.cloth, blank)

@@ -54,7 +54,7 @@ class Strip:
 
     def _apart(self, corners: Tensor) -> Tensor:
         """Energy J of triangles that do not hang together, from their corners [..., E, 3, 2] m."""
-        model = self.cloth.model()
+        model = self.cloth.build_model()
         x = corners.transpose(-3, -2).flatten(-3, -2)
         x = torch.cat([x, torch.zeros_like(x[..., :1])], dim=-1)
         geometry = model.geometry._replace(corners=torch.arange(x.shape[-2]))

@@ -16,7 +16,7 @@ import torch
 import torchcloth as tc
 from torchcloth import identification
 from torchcloth import recordings as rec
-from torchcloth.episodes.unknowns import available
+from torchcloth.episodes.unknowns import find_scalar_parameters
 from torchcloth.robots import replay
 
 SIDE = 0.3  # m
@@ -148,7 +148,7 @@ def at(recording: rec.Recording, **nominal: float) -> tc.Cloth:
     """The cloth of an episode with some start values changed."""
     model = identification.build_cloth(recording)
     for name, value in nominal.items():
-        model.get_submodule(available(model)[name]).set(value)
+        model.get_submodule(find_scalar_parameters(model)[name]).set(value)
     return model
 
 

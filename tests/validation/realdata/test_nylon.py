@@ -3,8 +3,8 @@
 The specimen is simulated: one of its 12 strips of 2.25 x 97 mm, clamped at both ends, pattern turned by the angle,
 pulled to equilibrium. The simulated curve begins at the machine's preload at zero displacement, which is not fitted.
 Four numbers are fitted to the four curves: E_warp h, E_weft h, G h and the warp's stiffening. `fit_tension` finds the
-same without a mesh. Poisson's ratio is not fitted (0.01; the authors of the data give -0.004). No isotropic law fits: at
-2 mm the forces differ by a factor of 5.7.
+same without a mesh. Poisson's ratio is not fitted (0.01; the authors of the data give -0.004). No isotropic law fits:
+at 2 mm the forces differ by a factor of 5.7.
 """
 
 import numpy as np

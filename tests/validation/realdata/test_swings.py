@@ -159,9 +159,9 @@ def test_identify_finds_the_air_that_moves_along(recording):
     """The whole run, with its strokes, gives the frequency of the free swings, 0.90 Hz, which was not fitted.
 
     Reached: 0.91 Hz; three other runs 0.92 Hz. Without added mass the misfit is 16.1 mm instead of 14.9 mm. Tangents
-    are useless beyond 2.4 s: they miss finite steps by their own size. The first 2.4 s, 22 of 98 frames, determine the fit.
-    Over all frames the misfit is 15.9 mm (19.7 mm for a rigidly carried cloth). Rightly, no parameter is identifiable:
-    nodes lean by 10 mm at rest, and drag has another coefficient at small amplitudes.
+    are useless beyond 2.4 s: they miss finite steps by their own size. The first 2.4 s, 22 of 98 frames, determine the
+    fit. Over all frames the misfit is 15.9 mm (19.7 mm for a rigidly carried cloth). Rightly, no parameter is
+    identifiable: nodes lean by 10 mm at rest, and drag has another coefficient at small amplitudes.
     """
     effects = {
         "gravity": tc.effects.Gravity(),

@@ -18,9 +18,9 @@ from typing import Any
 
 from torchcloth._utils.constants import Z_95
 from torchcloth.errors import InvalidInput
-from torchcloth.training.studies import hidden_scores as scores
-from torchcloth.training.studies.hidden_archive import read_round
 
+from ...studies import hidden_scores as scores
+from ...studies.hidden_archive import read_round
 from .effect_map import FITTED_FABRIC_VALUES
 
 COMMON_ERROR_FRACTIONS = (0.0, 0.02, 0.03, 0.04)  # of the value, standard deviations
@@ -38,7 +38,7 @@ def amplitude_errors(truth: dict[str, Any], answer: dict[str, Any]) -> Iterator[
     """Yield ("amplitudes", relative error, its standard error) of each effect that is named outright."""
     asked = scores.list_expected_effects(truth)
     for cause, wanted in zip(scores.match_causes(scores.list_named_causes(answer), asked), asked, strict=True):
-        if cause is not None and cause.best in wanted.names and wanted.comparable:
+        if cause is not None and cause.name in wanted.names and wanted.comparable:
             std = std_without_common_error(answer, cause.ci95, cause.amplitude) / abs(wanted.amplitude)
             yield "amplitudes", cause.amplitude / wanted.amplitude - 1, std
 

@@ -10,7 +10,7 @@ import torch
 
 from torchcloth import observe
 from torchcloth.recordings import PointClouds
-from torchcloth.robots import Scene
+from torchcloth.robots import Scene  # pyright: ignore[reportMissingImports] - mapped from robots/
 
 Array = np.ndarray
 Mesh = tuple[Array, Array]
@@ -44,7 +44,8 @@ class CameraPlacement:
         flat = np.cos(self.elevation)
         away = [flat * np.cos(self.azimuth), flat * np.sin(self.azimuth), np.sin(self.elevation)]
         eye = np.asarray(self.target) + self.distance * np.array(away)
-        return observe.DepthCamera(640, 576, RECTIFIED_INTRINSICS_PX, observe.look_at(eye, self.target), (0.5, 3.86))
+        pose = observe.look_at(eye, np.asarray(self.target))
+        return observe.DepthCamera(640, 576, RECTIFIED_INTRINSICS_PX, pose, (0.5, 3.86))
 
     def make_view(self) -> observe.View:
         """Return the camera with its noise and its processing."""
@@ -84,7 +85,8 @@ def observe_cloth(
         capture = observe.capture(view, x[i], faces, occluders(i), rng=rng)
         unoccluded, _ = observe.render_depth(view.camera, [(x[i], faces)])
         clouds.append(capture.points)
-        sigma.append(view.noise.sigma(view.camera.project(capture.points)[1]).mean())
+        depth = view.camera.project(capture.points)[1]
+        sigma.append(0.0 if view.noise is None else view.noise.sigma(depth).mean())
         visible_fraction.append((capture.mask & (capture.depth > 0)).sum() / (unoccluded > 0).sum())
     counts = np.array([len(cloud) for cloud in clouds])
     return PointClouds(np.asarray(t), np.concatenate(clouds), counts), float(np.mean(sigma)), np.array(visible_fraction)

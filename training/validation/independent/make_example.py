@@ -23,7 +23,8 @@ from typing import Any
 import numpy as np
 import torch
 
-from torchcloth import recordings, robots
+from torchcloth import recordings
+from torchcloth.robots import bimanual_rig  # pyright: ignore[reportMissingImports] - mapped from robots/
 
 from .first_frame import measured_mesh
 from .flex_sheet import SheetSpec, sheet_mesh
@@ -143,7 +144,7 @@ def make_example(settings: ExampleSettings) -> tuple[recordings.Recording, dict[
     """Return the episode, and figures about it."""
     torch.set_num_threads(1)
     shape_rng, points_rng, noise_rng = (np.random.default_rng([settings.seed, k]) for k in range(3))
-    rig = robots.bimanual_rig(model="rizon4", frame="tcp_closed")
+    rig = bimanual_rig(model="rizon4", frame="tcp_closed")
     t = settings.swing.times()
     q = solve_joint_positions(rig, settings.swing.poses(t))
     usage = measure_joint_usage(rig, t, q)
@@ -207,7 +208,7 @@ def _camera(settings: ExampleSettings) -> recordings.Camera:
     return recordings.Camera(width=camera.width, height=camera.height, K=camera.K, T_world_camera=camera.T_world_camera)
 
 
-def _true_parameters(settings: ExampleSettings) -> dict[str, Array]:
+def _true_parameters(settings: ExampleSettings) -> dict[str, Any]:
     """Return the true parameters, for scoring: they go into truth.npz, which no fit reads."""
     sheet = settings.sheet
     return {

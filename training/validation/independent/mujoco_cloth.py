@@ -154,7 +154,7 @@ class _ImplicitDamping:
         self.matrix, self.mass, self.prescribed = matrix, mass.copy(), prescribed
         self.free = np.setdiff1d(np.arange(len(mass)), prescribed)
         rows = (dt * matrix)[self.free]
-        self.solve = splu(csc_matrix(diags([mass[self.free]], [0]) + rows[:, self.free])).solve
+        self.solve = splu(csc_matrix(diags(mass[self.free]) + rows[:, self.free])).solve
         self.from_prescribed = rows[:, prescribed]
 
     def apply(self, v: Array) -> Array:

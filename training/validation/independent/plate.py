@@ -8,10 +8,10 @@ Rows next to the rim also stand for the rim, so that a uniformly bent sheet stor
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from scipy.sparse import csr_matrix, diags, kron, vstack
+from scipy.sparse import csr_matrix, diags, identity, kron, vstack
 
 from .flex_sheet import SheetSpec
 from .force_terms import ForceTerm, advance_dahl_friction
@@ -65,7 +65,7 @@ class CurvatureStencils:
         nu, nv = sheet.nodes
         shrinkage = (sheet.shrink_u, sheet.shrink_v)
         hu, hv = (np.diff(line) * (1 - s) for line, s in zip(sheet.grid_lines, shrinkage, strict=True))
-        one_u, one_v = diags([np.ones(nu)], [0]), diags([np.ones(nv)], [0])
+        one_u, one_v = identity(nu), identity(nv)
         twist = np.sqrt(2) * kron(_first_difference(hv), _first_difference(hu))
         blocks = [kron(one_v, _second_difference(hu)), kron(_second_difference(hv), one_u), twist]
         means = [
@@ -82,23 +82,27 @@ class CurvatureStencils:
         self.area, self.kind = np.concatenate(areas), np.repeat([0, 1, 2], [len(a) for a in areas])
 
 
+def _banded(diagonals: list[Any], offsets: list[int], shape: tuple[int, int]) -> csr_matrix:
+    return csr_matrix(diags(diagonals, offsets, shape=shape))  # type: ignore[arg-type]
+
+
 def _second_difference(h: Array) -> csr_matrix:
     left, right = h[:-1], h[1:]
     mean = 0.5 * (left + right)
     weights = [1 / (left * mean), -2 / (left * right), 1 / (right * mean)]
-    return diags(weights, [0, 1, 2], shape=(len(h) - 1, len(h) + 1))
+    return _banded(weights, [0, 1, 2], (len(h) - 1, len(h) + 1))
 
 
 def _first_difference(h: Array) -> csr_matrix:
-    return diags([-1 / h, 1 / h], [0, 1], shape=(len(h), len(h) + 1))
+    return _banded([-1 / h, 1 / h], [0, 1], (len(h), len(h) + 1))
 
 
 def _inner_selection(n: int) -> csr_matrix:
-    return diags([1.0], [1], shape=(n - 2, n))
+    return _banded([1.0], [1], (n - 2, n))
 
 
 def _midpoint_mean(n: int) -> csr_matrix:
-    return diags([0.5, 0.5], [0, 1], shape=(n - 1, n))
+    return _banded([0.5, 0.5], [0, 1], (n - 1, n))
 
 
 def _node_lengths(h: Array) -> Array:
@@ -121,7 +125,7 @@ class PlateBending(ForceTerm):
         """Assemble the stiffness matrix, and the damping matrix where damping is implicit."""
         stencils = CurvatureStencils(cloth.spec)
         weight = stencils.area * _moduli(self.spec, stencils) * _layer_factor(self.spec, cloth, stencils)
-        self.matrix = csr_matrix(stencils.rows.T @ diags([weight], [0]) @ stencils.rows)
+        self.matrix = csr_matrix(stencils.rows.T @ diags(weight) @ stencils.rows)
         tau = self.spec.damping_time
         self.damping_matrix = tau * self.matrix if tau and cloth.has_implicit_damping else None
         self.explicit_damping_time = tau if self.damping_matrix is None else 0.0
@@ -173,11 +177,11 @@ class InelasticBending(ForceTerm):
 def _moduli(spec: PlateSpec, stencils: CurvatureStencils) -> Array:
     """Return the bending stiffness [R] N m of each row."""
     ratio = 1 + spec.weft
-    return spec.stiffness * np.choose(stencils.kind, [1.0, ratio, np.sqrt(ratio)])
+    return np.asarray(spec.stiffness * np.choose(stencils.kind, [1.0, ratio, np.sqrt(ratio)]))
 
 
 def _layer_factor(spec: PlateSpec, cloth: MujocoCloth, stencils: CurvatureStencils) -> Array:
-    return 1 + spec.layer * (stencils.mean @ central_patch(cloth.spec, cloth.uv))
+    return np.asarray(1 + spec.layer * (stencils.mean @ central_patch(cloth.spec, cloth.uv)))
 
 
 def central_patch(sheet: SheetSpec, uv: Array) -> Array:

@@ -8,7 +8,7 @@ import numpy as np
 import torch
 
 from torchcloth.errors import InvalidInput
-from torchcloth.robots import Scene
+from torchcloth.robots import Scene  # pyright: ignore[reportMissingImports] - mapped from robots/
 
 Array = np.ndarray
 ARM_SIDES = {"left": 1.0, "right": -1.0}  # sign of y: the left arm stands at +y

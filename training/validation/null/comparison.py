@@ -63,7 +63,7 @@ def read_remeshed(folder: Path, nodes: int) -> recordings.Recording:
     recorded = meshes.Mesh.build(cloth.vertices, cloth.faces, cloth.uv)
     width, height = cloth.uv.max(0)
     mesh = meshes.rectangle(width, height, resolution=(nodes, nodes))
-    first = interpolate(recorded, mesh.uv, cloth.initial_vertices[None])[0]
+    first = interpolate(recorded, np.asarray(mesh.uv), cloth.initial_vertices[None])[0]
     remeshed = replace(cloth, vertices=mesh.vertices, faces=mesh.faces, uv=mesh.uv, initial_vertices=first)
     return replace(recording, cloth=remeshed)
 
@@ -71,7 +71,7 @@ def read_remeshed(folder: Path, nodes: int) -> recordings.Recording:
 def interpolate(mesh: meshes.Mesh, uv: Array, frames: Array) -> Array:
     """Return the positions [T, N, 3] m of pattern points [N, 2] m on frames [T, V, 3] m of a mesh."""
     points = torch.as_tensor(np.column_stack([uv, np.zeros(len(uv))]))
-    flat = torch.as_tensor(np.column_stack([mesh.uv, np.zeros(len(mesh.uv))]))
+    flat = torch.as_tensor(np.column_stack([np.asarray(mesh.uv), np.zeros(len(mesh.vertices))]))
     return find_closest_points(points, flat, torch.as_tensor(mesh.faces)).interpolate(torch.as_tensor(frames)).numpy()
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 
@@ -59,7 +59,7 @@ def draw_figure(results: dict[str, Any], motions: Sequence[str], meshes: Sequenc
     from matplotlib.figure import Figure
 
     style = {"font.size": 8, "axes.spines.top": False, "axes.spines.right": False, "legend.frameon": False}
-    with rc_context(style):
+    with rc_context(cast(Any, style)):
         columns = min(MAX_COLUMNS, len(motions))
         rows = -(-len(motions) // columns)
         figure = Figure(figsize=(1.7 * columns, 3.0 * rows + 0.3), layout="constrained")

@@ -29,8 +29,9 @@ def draw_swings(episodes: dict[str, Recording], path: Path) -> None:
     figure, axes = _make_figure(2, 3, (15, 8))
     for axis, run in zip(axes[0], ("range30_rep3", "range60_rep5", "range90_rep8"), strict=True):
         e = episodes[run]
-        good, mesh = e.markers.extra["accepted"], e.markers.xyz.reshape(-1, 8, 8, 3)
-        t, edge, low = e.markers.t + e.clock_offset, mesh[:, 1:-1, -1, 1], mesh[:, 1:-1, 0, 1]
+        markers = e.require("markers")
+        good, mesh = markers.extra["accepted"], markers.xyz.reshape(-1, 8, 8, 3)
+        t, edge, low = markers.t + e.clock_offset, mesh[:, 1:-1, -1, 1], mesh[:, 1:-1, 0, 1]
         tool = e.grippers["hanger"]
         axis.plot(tool.t, tool.position[:, 1], color=GUIDE_GREY, label="tool")
         axis.plot(t[good], np.nanmedian(edge, 1)[good], ".", color=MEASURED_BLUE, label="upper edge")
@@ -40,12 +41,13 @@ def draw_swings(episodes: dict[str, Recording], path: Path) -> None:
         axis.set_ylabel("y, along the stroke, m")
     axes[0, 0].legend(fontsize=8)
     e = episodes["range60_rep5"]
-    good, mesh, t = e.markers.extra["accepted"], e.markers.xyz.reshape(-1, 8, 8, 3), e.markers.t + e.clock_offset
+    markers = e.require("markers")
+    good, mesh, t = markers.extra["accepted"], markers.xyz.reshape(-1, 8, 8, 3), markers.t + e.clock_offset
     for axis, begin in zip(axes[1], (0.0, 4.0, 9.9), strict=True):
         for i in np.flatnonzero(good & (t > begin))[:8]:
             side = np.nanmedian(mesh[i], axis=0)
             axis.plot(side[:, 1], side[:, 2], ".-", ms=4, label=f"{t[i]:.1f} s")
-        corners = e.cloth.initial_vertices.mean(0)
+        corners = np.asarray(e.cloth.initial_vertices).mean(0)
         if begin == 0:
             axis.plot(corners[:, 1], corners[:, 2], color="k", label="flat sheet of the episode")
         middle = np.mean(axis.get_xlim())
@@ -59,9 +61,10 @@ def draw_lifts(episodes: dict[str, Recording], path: Path) -> None:
     """Draw three frames of every lift along x with the path; removed points are red."""
     figure, axes = _make_figure(3, len(episodes), (20, 9))
     for column, (trial, e) in zip(axes.T, episodes.items(), strict=True):
-        gripper, ends = e.grippers["gripper"], np.cumsum(e.points.counts)
+        gripper, points = e.grippers["gripper"], e.require("points")
+        ends = np.cumsum(points.counts)
         for axis, i in zip(column, (8, 16, 24), strict=True):
-            cloud, cloth = e.points.frame(i), e.points.extra["cloth"][ends[i] - e.points.counts[i] : ends[i]]
+            cloud, cloth = points.frame(i), points.extra["cloth"][ends[i] - points.counts[i] : ends[i]]
             axis.plot(*cloud[cloth][:, 1:].T, ",", color=MEASURED_BLUE)
             axis.plot(*cloud[~cloth][:, 1:].T, ".", color="red", ms=3)
             axis.plot(gripper.position[: i + 1, 1], gripper.position[: i + 1, 2], color="k", lw=1)

@@ -250,8 +250,9 @@ def main() -> None:
     source = source_folder(parser, options.source, "diffcp_sample")
     recording = read_recording(source, options.seconds_per_step, options.clouds)
     recordings.write(recording, options.episode)
-    size = f"{len(recording.cloth.vertices)} vertices, {len(recording.cloth.faces)} triangles"
-    print(f"{options.episode}: {size}, {len(recording.points)} clouds, {recording.points.t[-1]:.3g} s")
+    mesh, points = recording.extra["notes"]["mesh"], recording.require("points")
+    size = f"{mesh['vertices_after_merging']} vertices, {mesh['triangles_after_merging']} triangles"
+    print(f"{options.episode}: {size}, {len(points)} clouds, {points.t[-1]:.3g} s")
 
 
 if __name__ == "__main__":

@@ -177,7 +177,7 @@ def signed_areas(corners: np.ndarray) -> np.ndarray:
 def _symmetric_matrix(values: np.ndarray, pairs: np.ndarray, size: int) -> csr_matrix:
     i, j = pairs.T
     both = np.concatenate([values, values]), (np.concatenate([i, j]), np.concatenate([j, i]))
-    return coo_matrix(both, shape=(size, size)).tocsr()
+    return csr_matrix(coo_matrix(both, shape=(size, size)))
 
 
 def _edge_length_graph(vertices: np.ndarray, faces: np.ndarray) -> csr_matrix:

@@ -13,7 +13,7 @@ Decay: air drag is quadratic, so the amplitude falls as A' = -B A^2, A = A0 / (1
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import numpy as np
 
@@ -122,7 +122,8 @@ def fit_decay(swings: Sequence[FreeSwing], quadratic: bool = True) -> DecayFit:
     t, q = (np.concatenate(part) for part in zip(*((s.t, s.q) for s in swings), strict=True))
     run_columns = np.arange(3)[:, None] * count + owner + 2  # [3, F], of the numbers of a frame's run
 
-    def model(frequency, decay, rest, cosine, sine):
+    def model(*numbers: Any) -> Any:
+        frequency, decay, rest, cosine, sine = numbers
         return (rest + damped_oscillation(t, frequency, decay, cosine, sine, quadratic)) / ROBUST_SCALE_M
 
     def residual(p: np.ndarray) -> np.ndarray:
@@ -145,7 +146,10 @@ def fit_decay(swings: Sequence[FreeSwing], quadratic: bool = True) -> DecayFit:
         return np.concatenate([[frequency, 15.0 if quadratic else 0.9], np.transpose(solutions).ravel()])
 
     best: Any = min(
-        (least_squares(residual, start(f), jacobian, loss="soft_l1", x_scale="jac", max_nfev=200) for f in (0.85, 1.0)),
+        (
+            least_squares(residual, start(f), cast(Any, jacobian), loss="soft_l1", x_scale="jac", max_nfev=200)
+            for f in (0.85, 1.0)
+        ),
         key=lambda result: result.cost,
     )
     return DecayFit(float(best.x[0]), float(best.x[1]), float(best.cost), *best.x[2:].reshape(3, count))

@@ -85,7 +85,8 @@ def connected_components(cloud: np.ndarray, cell: float = VOXEL_SIZE_M) -> np.nd
     place = np.floor((cloud - cloud.min(0)) / cell).astype(int)
     occupied = np.zeros(place.max(0) + 1, dtype=bool)
     occupied[tuple(place.T)] = True
-    return label(occupied, np.ones((3, 3, 3)))[0][tuple(place.T)]
+    components, _ = label(occupied, np.ones((3, 3, 3)))  # type: ignore[misc]
+    return components[tuple(place.T)]
 
 
 def is_cloth(cloud: np.ndarray, top: float) -> np.ndarray:
@@ -247,7 +248,7 @@ def main() -> None:
     source = source_folder(parser, options.source, "lifted_cloth_clouds")
     recording = read_episode(source, options.trial, not options.everything, options.spacing)
     recordings.write(recording, options.episode)
-    print(f"{options.episode}: {len(recording.points)} frames, {recording.extra['notes']['points']}")
+    print(f"{options.episode}: {len(recording.require('points'))} frames, {recording.extra['notes']['points']}")
 
 
 if __name__ == "__main__":

@@ -172,7 +172,7 @@ def summarise_cantilever(source: Path, out: Path) -> OverviewRow:
     """Summarise the one profile."""
     recording = write_and_read_back(cantilever.read_episode(source), out / "strip")
     line = cantilever.midline_profile(recording)
-    roughness = line[:, 1] - np.polyval(np.polyfit(*line.T, 6), line[:, 0])
+    roughness = line[:, 1] - np.polyval(np.polyfit(line[:, 0], line[:, 1], 6), line[:, 0])
     data_figures.draw_cantilever(line, cantilever.read_moment_table(source), out.parent / "cantilever.png")
     return OverviewRow(
         "cantilever",

@@ -85,7 +85,8 @@ def arc_lengths(mesh: np.ndarray) -> np.ndarray:
 
 def accepted_frames(run: Run) -> np.ndarray:
     """Return which frames [F] have arcs of the sheet's length."""
-    return (np.abs(arc_lengths(run["mesh_base_m"]) / SHEET_SIDE_M - 1) < MAX_ARC_DEVIATION).all(1)
+    is_close = np.abs(arc_lengths(run["mesh_base_m"]) / SHEET_SIDE_M - 1) < MAX_ARC_DEVIATION
+    return np.asarray(is_close.all(1))
 
 
 def motion_start(run: Run) -> float:
@@ -190,7 +191,7 @@ def read_episode(path: Path, run: str) -> Recording:
     data = read_runs(Path(path))[run]
     (t, position, quat), lag, is_accepted = tool_motion(data), estimate_lag(data), accepted_frames(data)
     stamps, mesh = data["t_mesh_s"], data["mesh_base_m"].reshape(len(data["t_mesh_s"]), -1, 3)
-    has_depth = np.isfinite(mesh).all(-1)
+    has_depth = np.asarray(np.isfinite(mesh).all(-1))
     mesh = np.where(has_depth[..., None], mesh, np.nan)
     use = is_accepted & (stamps - lag.value >= t[0]) & (stamps - lag.value <= t[-1])
     edge = np.linspace(0, SHEET_SIDE_M, 31)
@@ -250,7 +251,7 @@ def main() -> None:
     options = parser.parse_args()
     recording = read_episode(source_folder(parser, options.source, "iri_cloth_swings"), options.run)
     recordings.write(recording, options.episode)
-    print(f"{options.episode}: {len(recording.points)} frames, {recording.extra['notes']['frames']}")
+    print(f"{options.episode}: {len(recording.require('points'))} frames, {recording.extra['notes']['frames']}")
 
 
 if __name__ == "__main__":

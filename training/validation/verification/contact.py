@@ -209,7 +209,7 @@ def fold_and_unfold(fast: bool) -> Outcome:
     """Fold an edge over, press it on the layer below, and fold it back."""
     size, n, spacing = 0.10, 11, 6e-3
     mesh = tc.meshes.rectangle(size, size, resolution=(n, n))
-    u = mesh.uv[:, 0]
+    u = mesh.vertices[:, 0]
     cloth = make_sheet_on_table(
         size, n, spacing, {"left": indices_where(u < 1e-9), "right": indices_where(u > size - 1e-9)}
     )

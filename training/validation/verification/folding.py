@@ -44,7 +44,7 @@ def single_precision() -> Iterator[None]:
 def make_towel() -> tc.Cloth:
     """Return a cloth on a table: Y = 300 N/m, k h = 60 N/m, 0.2 kg/m^2, B = 1e-5 N m."""
     mesh = tc.meshes.rectangle(TOWEL_SIDE_M, TOWEL_SIDE_M, resolution=(TOWEL_NODES, TOWEL_NODES))
-    u, v = mesh.uv.T
+    u, v = np.asarray(mesh.uv).T
     edges = {"left": u < 1e-9, "right": u > TOWEL_SIDE_M - 1e-9, "back": v > TOWEL_SIDE_M - 1e-9}
     grasps = {name: tc.boundaries.Grasp(indices_where(edge)) for name, edge in edges.items()}
     return tc.Cloth(
@@ -98,6 +98,7 @@ def intersect_verticals(x: np.ndarray, mesh: Mesh, places: np.ndarray) -> Iterat
     Yields:
         Heights [K] m and pattern coordinates [K, 2] m for each line.
     """
+    uv = np.asarray(mesh.uv)
     a, b, c = (x[mesh.faces[:, k]] for k in range(3))
     e1, e2 = (b - a)[:, :2], (c - a)[:, :2]
     double_area = e1[:, 0] * e2[:, 1] - e1[:, 1] * e2[:, 0]
@@ -110,7 +111,7 @@ def intersect_verticals(x: np.ndarray, mesh: Mesh, places: np.ndarray) -> Iterat
         weights = np.stack([1 - s - t, s, t], -1)[hit, :, None]
         height = (weights[..., 0] * x[mesh.faces[hit], 2]).sum(1)
         order = np.argsort(height)
-        yield height[order], (weights * mesh.uv[mesh.faces[hit]]).sum(1)[order]
+        yield height[order], (weights * uv[mesh.faces[hit]]).sum(1)[order]
 
 
 def measure_gaps(x: np.ndarray, mesh: Mesh, quarter: bool) -> tuple[np.ndarray, int]:
@@ -157,7 +158,8 @@ def crossing_distances(x: np.ndarray, mesh: Mesh) -> np.ndarray:
     s, q = (offset * p).sum(-1) / volume, np.cross(offset, first)
     t, along_edge = (along * q).sum(-1) / volume, (second * q).sum(-1) / volume
     hit = (s >= 0) & (t >= 0) & (s + t <= 1) & (along_edge >= 0) & (along_edge <= 1)
-    return np.linalg.norm(mesh.uv[edges[e[hit]]].mean(1) - mesh.uv[mesh.faces[f[hit]]].mean(1), axis=-1)
+    uv = np.asarray(mesh.uv)
+    return np.linalg.norm(uv[edges[e[hit]]].mean(1) - uv[mesh.faces[f[hit]]].mean(1), axis=-1)
 
 
 def section(x: np.ndarray, mesh: Mesh, direction: int, position: float) -> Iterator[tuple[np.ndarray, int]]:
@@ -171,7 +173,7 @@ def section(x: np.ndarray, mesh: Mesh, direction: int, position: float) -> Itera
         crossed = [(i, j) for i, j in ((0, 1), (1, 2), (2, 0)) if (side[i] > 0) != (side[j] > 0)]
         if crossed:
             p = [x[face[i]] + (x[face[j]] - x[face[i]]) * side[i] / (side[i] - side[j]) for i, j in crossed]
-            u, v = mesh.uv[face].mean(0) > TOWEL_SIDE_M / 2
+            u, v = np.asarray(mesh.uv)[face].mean(0) > TOWEL_SIDE_M / 2
             yield np.array(p)[:, [direction, 2]], int(u) + 2 * int(v)
 
 
@@ -230,6 +232,7 @@ def fold_half_a_metre(fast: bool) -> Outcome:
     """Fold the right edge onto the left one, then the back edge of both layers, and measure gaps and crossings."""
     cloth, x, speed = simulate_folding()
     mesh, grid = cloth.mesh, cloth.contact_grid()
+    assert grid is not None
     # contact acts between points of triangles that are farther apart in the pattern
     blind_range = FOLD_PATH_RATIO * grid.reach + mesh.mean_edge
     distances = [crossing_distances(frame, mesh) for frame in x]

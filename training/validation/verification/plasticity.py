@@ -43,7 +43,8 @@ def simulate_tension_history(strain: tuple[float, float], release: float, times:
         out = cloth(cloth.rest_state(), motion, times=times, dt=5e-5)
     right, upper = ([k for k in rim if mesh.vertices[k, axis] > SQUARE_SIDE_M - 1e-9] for axis in (0, 1))
     tension = [
-        -sum(out.wrench[str(k)][:, axis] for k in side) / SQUARE_SIDE_M for axis, side in enumerate((right, upper))
+        -torch.as_tensor(sum(out.wrench[str(k)][:, axis] for k in side)) / SQUARE_SIDE_M
+        for axis, side in enumerate((right, upper))
     ]
     return torch.stack(tension, -1).numpy()
 

@@ -116,8 +116,9 @@ def turning_cylinder(fast: bool) -> Outcome:
     """Measure the damping power on a sheet that is rolled to a cylinder and turns about its axis."""
     radius, speed, stiffness, time = 0.1, 6.0, 3e-5, 5e-3
     mesh = tc.meshes.rectangle(0.3, 0.2, resolution=(31, 21))
-    angle = torch.as_tensor(mesh.uv[:, 0]) / radius
-    x = torch.stack([radius * angle.sin(), torch.as_tensor(mesh.uv[:, 1]), radius * angle.cos()], dim=-1)
+    width, height = torch.as_tensor(mesh.uv).T
+    angle = width / radius
+    x = torch.stack([radius * angle.sin(), height, radius * angle.cos()], dim=-1)
     v = torch.linalg.cross(torch.tensor([0.0, speed, 0.0]).expand_as(x), x)
     powers = []
     for damping in (time, None):
@@ -126,7 +127,10 @@ def turning_cylinder(fast: bool) -> Outcome:
         effect, c = model.effects["b"]
         now = EffectInputs(x, v, surface(model.geometry, x, v), model.mass)
         still = now._replace(v=torch.zeros_like(v))
-        powers.append(-float(((effect.force(c, now) - effect.force(c, still)) * state.v).sum().detach()))
+        moving, static = (effect.force(c, inputs) for inputs in (now, still))
+        assert moving is not None
+        assert static is not None
+        powers.append(-float(((moving - static) * state.v).sum().detach()))
     power = stiffness * time * (speed / radius) ** 2 * 0.06
     return Outcome(
         [
