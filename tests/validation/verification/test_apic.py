@@ -23,13 +23,13 @@ def test_apic_falls_freely_and_needs_a_grid():
         APICCloth(mesh, tc.materials.AEP(1e5), DENSITY, contact=None)
 
 
-def test_all_that_weighs_is_on_the_grid():
+def test_particles_have_all_mass():
     mesh = tc.meshes.rectangle(0.2, 0.2, resolution=(5, 5))
     cloth = APICCloth(mesh, tc.materials.AEP(1e5), DENSITY, {"hem": tc.effects.LineMass(0.02)})
     model, state = cloth.build_model(), cloth.rest_state()
-    carried = apic._masses(model, state, surface(model.geometry, state.x, state.v))
-    torch.testing.assert_close(carried.sum(), model.mass.sum())
-    assert bool((carried > 0).all())
+    masses = apic._particle_masses(model, state, surface(model.geometry, state.x, state.v))
+    torch.testing.assert_close(masses.sum(), model.mass.sum())
+    assert bool((masses > 0).all())
 
 
 def test_apic_brakes_a_turning_sheet_and_our_scheme_does_not():

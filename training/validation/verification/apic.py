@@ -1,4 +1,4 @@
-"""APIC, the usual material point scheme, for comparison: all forces pass through the grid (Jiang, Gast, Teran 2017).
+"""APIC, the usual material point scheme, for comparison (Jiang, Gast, Teran 2017): all forces pass through the grid.
 
 Vertices and triangles are particles; a quarter of a triangle's mass goes to each corner and to itself. The transfer
 filters velocities at every substep, so its damping depends on dt. docs/validation/verification.md shows both schemes.
@@ -91,63 +91,71 @@ def step(
     model: Model,
     state: ClothState,
     dt: float,
-    drives: Mapping[str, PrescribedMotion],
+    prescribed: Mapping[str, PrescribedMotion],
     substep: int,
-    layers: ContactCandidates | None = None,
-    lost: Tensor | None = None,
+    contact_candidates: ContactCandidates | None = None,
+    compensation: Tensor | None = None,
 ) -> tuple[ClothState, Impulses]:
-    """Advance the cloth by one substep: a ``CustomSubstep``.
+    """Advance the cloth by one substep, as the ``advance`` of a ``CustomSubstep``.
 
     ``state.memory["apic"]`` [..., V + E, 9] 1/s are the affine velocities of the particles: vertices, then triangles.
     """
     grid = cast("Grid", model.grid)  # APICCloth refuses to be made without
-    s = surface(model.geometry, state.x, state.v, lost)
-    memory = update_memory(model, state, s, dt, lost)
-    layers = find_contact_candidates(model, grid, state.x) if layers is None else layers
-    press = compute_director_forces(model, grid, layers, state, s, dt)
-    columns = add_director_stress(layers, membrane_stress(model, s, memory), press)
-    nothing = (torch.zeros_like(columns[0]), torch.zeros_like(columns[1]))
-    # Weight, air: triangles get their share of it as well. Of air that moves along, nothing.
-    light = {name: (effect, c) for name, (effect, c) in model.effects.items() if effect.inertia(c, s) is None}
-    airless = model._replace(effects=light)
-    outer = vertex_forces(airless, state, s, memory, nothing, lost)
-    force = vertex_forces(airless, state, s, memory, columns, lost) - outer
-    v = state.v + dt * outer / model.mass
+    s = surface(model.geometry, state.x, state.v, compensation)
+    memory = update_memory(model, state, s, dt, compensation)
+    if contact_candidates is None:
+        contact_candidates = find_contact_candidates(model, grid, state.x)
+    director_forces = compute_director_forces(model, grid, contact_candidates, state, s, dt)
+    stress = add_director_stress(contact_candidates, membrane_stress(model, s, memory), director_forces)
+
+    # weight and air drag act on triangles, too: they change velocities before the grid. Air has no added mass here
+    zero_stress = (torch.zeros_like(stress[0]), torch.zeros_like(stress[1]))
+    effects = {name: (effect, c) for name, (effect, c) in model.effects.items() if effect.inertia(c, s) is None}
+    model_without_air = model._replace(effects=effects)
+    effect_force = vertex_forces(model_without_air, state, s, memory, zero_stress, compensation)
+    stress_force = vertex_forces(model_without_air, state, s, memory, stress, compensation) - effect_force
+    v = state.v + dt * effect_force / model.mass
 
     batch, vertices = state.x.shape[:-2], state.x.shape[-2]
     position, velocity = (
         torch.cat([field, centroids(model.geometry, field)], dim=-2).reshape(-1, 3) for field in (state.x, v)
     )
-    mass = _masses(model, state, s).reshape(-1, 1)
-    each = position.shape[0] // max(1, batch.numel())
-    scene = torch.arange(batch.numel(), device=position.device).repeat_interleave(each)
-    nodes = place_on_grid(position, mass, scene, grid, layers.node_scratch)
+    mass = _particle_masses(model, state, s).reshape(-1, 1)
+    particles = position.shape[0] // max(1, batch.numel())  # of one scene
+    scene = torch.arange(batch.numel(), device=position.device).repeat_interleave(particles)
+    nodes = place_on_grid(position, mass, scene, grid, contact_candidates.node_scratch)
 
     affine = memory[MEMORY_NAME].reshape(-1, 3, 3)
     momentum = affine_momentum(nodes, mass, velocity, affine, grid.spacing)
-    slope = nodes.weight_gradient.unflatten(0, (-1, each))[:, vertices:].flatten(0, 1)
-    director = -(slope @ press.d3.unsqueeze(-1)) * press.energy_by_d3.unsqueeze(-2)
-    weight = nodes.weight.unflatten(0, (-1, each))[:, :vertices].flatten(0, 1)
-    mesh = weight.unsqueeze(-1) * force.reshape(-1, 1, 3)
-    both = torch.cat([part.unflatten(0, (batch.numel(), -1)) for part in (mesh, director)], dim=1).flatten(0, 1)
-    seen = sum_on_nodes(nodes.node, momentum + dt * both) * nodes.inverse_mass.unsqueeze(-1)
+    slope = nodes.weight_gradient.unflatten(0, (-1, particles))[:, vertices:].flatten(0, 1)
+    triangle_force = -(slope @ director_forces.d3.unsqueeze(-1)) * director_forces.energy_by_d3.unsqueeze(-2)
+    weight = nodes.weight.unflatten(0, (-1, particles))[:, :vertices].flatten(0, 1)
+    vertex_force = weight.unsqueeze(-1) * stress_force.reshape(-1, 1, 3)
+    particle_force = torch.cat(
+        [part.unflatten(0, (batch.numel(), -1)) for part in (vertex_force, triangle_force)], dim=1
+    ).flatten(0, 1)
+    node_momentum = sum_on_nodes(nodes.node, momentum + dt * particle_force)
+    node_velocity = node_momentum * nodes.inverse_mass.unsqueeze(-1)
 
     arm = (stencil_nodes(position) - nodes.offset.unsqueeze(-2)) * grid.spacing
-    weighted = nodes.weight.unsqueeze(-1) * seen
-    memory[MEMORY_NAME] = (4 / grid.spacing**2 * weighted.mT @ arm).view(*batch, each, 9)
-    free = weighted.sum(-2).view(*batch, each, 3)[..., :vertices, :]
-    v, impulses = apply_boundaries(model, state.x, free, dt, drives, substep, None)
+    weighted_velocity = nodes.weight.unsqueeze(-1) * node_velocity
+    memory[MEMORY_NAME] = (4 / grid.spacing**2 * weighted_velocity.mT @ arm).view(*batch, particles, 9)
+    free = weighted_velocity.sum(-2).view(*batch, particles, 3)[..., :vertices, :]
+    v, impulses = apply_boundaries(model, state.x, free, dt, prescribed, substep, None)
     x = state.x + dt * v
 
-    gradient = (seen.mT @ nodes.weight_gradient).unflatten(0, (-1, each))[:, vertices:].flatten(0, 1)
-    moved = press.d3 + dt * (gradient @ press.d3.unsqueeze(-1)).squeeze(-1)
+    gradient = (node_velocity.mT @ nodes.weight_gradient).unflatten(0, (-1, particles))[:, vertices:].flatten(0, 1)
+    d3 = director_forces.d3 + dt * (gradient @ director_forces.d3.unsqueeze(-1)).squeeze(-1)
     n = surface(model.geometry, x, v).n.reshape(-1, 1, 3)
-    mapped = model.material.return_map(coefficients_per_point(model, layers, s), n, moved.unsqueeze(-2))
-    return ClothState(x, v, mapped.view(state.d3.shape), memory), impulses
+    d3 = model.material.return_map(coefficients_per_point(model, contact_candidates, s), n, d3.unsqueeze(-2))
+    return ClothState(x, v, d3.view(state.d3.shape), memory), impulses
 
 
-def _masses(model: Model, state: ClothState, s: Surface) -> Tensor:
-    """[..., V + E, 1] kg; what triangles carry is not the vertices', what effects add is."""
+def _particle_masses(model: Model, state: ClothState, s: Surface) -> Tensor:
+    """Return masses [..., V + E, 1] kg of vertices, then triangles.
+
+    A triangle takes a quarter of its fabric's mass from its corners. What effects add stays with the vertices.
+    """
     triangle = (model.areal_density * s.area / 4).expand(*s.n.shape[:-1], 1)
     vertex = model.mass.expand(*state.x.shape[:-1], 1)
     corners = torch.cat([triangle / 3] * 3, dim=-2)
