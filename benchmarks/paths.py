@@ -36,7 +36,7 @@ FABRIC_PARAMETERS = (
 class Pull(AbstractEffect):
     """A user's force on every vertex, so weak that all paths give the same positions."""
 
-    amplitudes = {"strength": Amplitude("N", 1e-12, 1e-13)}
+    amplitudes = {"strength": Amplitude(unit="N", typical=1e-12, smallest=1e-13)}
 
     def __init__(self) -> None:
         super().__init__()

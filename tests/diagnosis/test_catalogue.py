@@ -23,8 +23,16 @@ class Jet(AbstractEffect):
     """A constant force; its second parameter is not asked about."""
 
     amplitudes = {
-        "pressure": Amplitude("Pa", 1.0, 0.2, ("air.wind",), cause="my.air.jet", title="Jet", description="It blows."),
-        "width": Amplitude("m", 0.1),
+        "pressure": Amplitude(
+            unit="Pa",
+            typical=1.0,
+            smallest=0.2,
+            confounded_with=("air.wind",),
+            cause="my.air.jet",
+            title="Jet",
+            description="It blows.",
+        ),
+        "width": Amplitude(unit="m", typical=0.1),
     }
 
     def __init__(self, pressure=1.0, width=0.1):
@@ -105,4 +113,4 @@ def test_a_declaration_is_read_as_a_hypothesis():
 def test_a_prior_and_a_diagnosis_may_call_different_amounts_typical():
     rate = tc.effects.MassDamping.amplitudes["rate"]
     assert (rate.typical, rate.typical_of_cause, rate.smallest_fraction) == (1.0, 2.0, 0.4)
-    assert Amplitude("m", -2.0, 0.5, signed=True).smallest_fraction == 0.25
+    assert Amplitude(unit="m", typical=-2.0, smallest=0.5, signed=True).smallest_fraction == 0.25

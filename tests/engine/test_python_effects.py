@@ -17,7 +17,7 @@ TIMES = (0.0, 0.4 * END, END)
 class Pull(AbstractEffect):
     """On vertices, and it is felt in proportion to the speed."""
 
-    amplitudes = {"strength": Amplitude("N", 1e-3, 1e-4)}
+    amplitudes = {"strength": Amplitude(unit="N", typical=1e-3, smallest=1e-4)}
 
     def __init__(self, strength=1e-3):
         super().__init__()

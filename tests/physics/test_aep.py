@@ -45,7 +45,7 @@ def test_forces_are_minus_the_gradient_of_the_energy(convention, seed):
     columns = self_contact.add_director_stress(layers, elasticity.membrane_stress(model, s, {}), director)
     force = forces.vertex_forces(model, state, s, {}, columns)
     torch.testing.assert_close(force, -by_x, rtol=1e-10, atol=1e-10 * by_x.abs().max())
-    torch.testing.assert_close(director.pull, by_d3, rtol=1e-10, atol=1e-10 * by_d3.abs().max())
+    torch.testing.assert_close(director.energy_by_d3, by_d3, rtol=1e-10, atol=1e-10 * by_d3.abs().max())
 
 
 def test_energy_equals_the_singular_value_form_of_the_paper():

@@ -49,7 +49,7 @@ class MeshSolid(AbstractCollider):
         **options: Unpack[ColliderOptions],
     ) -> None:
         super().__init__(friction, pose=pose, **options)
-        x, f = _closed(np.array(vertices, np.float64), np.array(faces, np.int64))
+        x, f = _check_and_compact(np.array(vertices, np.float64), np.array(faces, np.int64))
         low, extent = x.min(0), np.ptp(x, axis=0)
         cell = float(extent.max() / 48 if cell is None else cell)
         if not 0 < cell < np.inf:
@@ -114,7 +114,12 @@ def _bilinear(c00: Tensor, c01: Tensor, c10: Tensor, c11: Tensor, y: Tensor, z: 
     return low + y * (high - low), high - low, (c01 - c00) + y * ((c11 - c10) - (c01 - c00))
 
 
-def _closed(x: np.ndarray, f: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _check_and_compact(x: np.ndarray, f: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Check that a mesh is closed, and return it without unused vertices: [V, 3] m and [F, 3].
+
+    Raises:
+        InvalidInput: shapes, indices or values that are wrong, or an edge without exactly two triangles.
+    """
     if x.ndim != 2 or x.shape[1] != 3 or f.ndim != 2 or f.shape[1] != 3 or not len(f) or not np.isfinite(x).all():
         raise InvalidInput(
             "solid mesh", got=f"shapes {x.shape} and {f.shape}", expected="finite vertices [V, 3] and faces [F, 3]"

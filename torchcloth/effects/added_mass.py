@@ -38,8 +38,8 @@ class AddedMass(AbstractEffect):
 
     amplitudes = {
         "length": Amplitude(
-            "m",
-            0.15,
+            unit="m",
+            typical=0.15,
             confounded_with=("Gravity.acceleration", "contact.mu"),
             cause="air.added_mass",
             title="Added mass of air",

@@ -42,8 +42,8 @@ class Adhesion(AbstractEffect):
 
     amplitudes = {
         "stress": Amplitude(
-            "Pa",
-            1.5,
+            unit="Pa",
+            typical=1.5,
             confounded_with=("contact.mu",),
             cause="contact.adhesion",
             title="Adhesion to the table",

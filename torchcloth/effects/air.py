@@ -24,13 +24,13 @@ class Coefficients(NamedTuple):
     """What the drag force needs.
 
     Attributes:
-        pressure: [..., 1 or E, 1] kg/m^3, half the air's density times C_n.
-        friction: [..., 1 or E, 1] kg/m^3, half the air's density times C_t.
+        half_density_cn: [..., 1 or E, 1] kg/m^3, half the air's density times C_n.
+        half_density_ct: [..., 1 or E, 1] kg/m^3, half the air's density times C_t.
         wind: [..., 1, 3] m/s, velocity of the air.
     """
 
-    pressure: Tensor
-    friction: Tensor
+    half_density_cn: Tensor
+    half_density_ct: Tensor
     wind: Tensor
 
 
@@ -54,8 +54,8 @@ class AirDrag(AbstractEffect):
 
     amplitudes = {
         "normal": Amplitude(
-            "-",
-            1.2,
+            unit="-",
+            typical=1.2,
             confounded_with=("air.linear",),
             cause="air.drag_n",
             title="Air drag, normal (C_n)",
@@ -63,16 +63,16 @@ class AirDrag(AbstractEffect):
             "(1.2: a flat plate).",
         ),
         "tangential": Amplitude(
-            "-",
-            0.016,
+            unit="-",
+            typical=0.016,
             confounded_with=("air.linear",),
             cause="air.drag_t",
             title="Air drag, tangential (C_t)",
             description="Air rubs along cloth that moves edgewise; as a rule too little to be seen.",
         ),
         "wind": Amplitude(
-            "m/s",
-            0.3,
+            unit="m/s",
+            typical=0.3,
             confounded_with=("env.gravity_tilt",),
             signed=True,
             cause="air.wind",
@@ -111,7 +111,7 @@ class AirDrag(AbstractEffect):
         return self
 
     def coefficients(self) -> Coefficients:
-        """Return dynamic pressures per squared velocity, and the wind."""
+        """Return half the air's density times each drag coefficient, and the wind."""
         half = 0.5 * self.density
         return Coefficients(half * self.normal.field, half * self.tangential.field, self.wind.unsqueeze(-2))
 
@@ -119,10 +119,11 @@ class AirDrag(AbstractEffect):
         """Return the drag on each triangle."""
         surface = inputs.surface
         relative = surface.v - c.wind
-        speed = dot(relative, surface.n)
-        along = relative - speed * surface.n
+        speed = dot(relative, surface.n)  # u_n
+        along = relative - speed * surface.n  # u_t
         area = surface.area * surface.J
-        return -(c.pressure * area * speed.abs() * speed) * surface.n - (c.friction * area * safe_norm(along)) * along
+        across = c.half_density_cn * area * speed.abs() * speed
+        return -across * surface.n - (c.half_density_ct * area * safe_norm(along)) * along
 
     def stability_bounds(self, c: Coefficients, mass: Tensor) -> tuple[Tensor, Tensor]:
         """Bound the spectrum of a sheet at rest in the wind, by row sums.
@@ -131,7 +132,7 @@ class AirDrag(AbstractEffect):
         |df/du| <= 2 max(P, Q) |u| a, |df/dN| <= 3 (P + Q) |u|^2, and a corner moves N by half of the opposite edge.
         Both are 0 in still air.
         """
-        wind, normal, along = safe_norm(c.wind).amax(), c.pressure.amax(), c.friction.amax()
+        wind, normal, along = safe_norm(c.wind).amax(), c.half_density_cn.amax(), c.half_density_ct.amax()
         turning = (normal + along) * wind * wind * (self.half_perimeter / mass).amax()
         return turning, 2 * torch.maximum(normal, along) * wind * (self.vertex_area / mass).amax()
 

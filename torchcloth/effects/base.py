@@ -67,7 +67,7 @@ class AbstractEffect(nn.Module, ABC):
     Override the hooks that it needs: all others return None and cost nothing. A constant force per vertex:
 
         class Pull(AbstractEffect):
-            amplitudes = {"strength": Amplitude("N", 1e-3, 1e-4)}
+            amplitudes = {"strength": Amplitude(unit="N", typical=1e-3, smallest=1e-4)}
 
             def __init__(self, strength=1e-3):
                 super().__init__()

@@ -48,8 +48,8 @@ class Coefficients(NamedTuple):
 
 
 _CURL = Amplitude(
-    "1/m",
-    3.0,
+    unit="1/m",
+    typical=3.0,
     confounded_with=("plast.crease",),
     signed=True,
     cause="rest.curl",
@@ -90,10 +90,10 @@ class Bending(AbstractEffect):
     """
 
     amplitudes = {
-        "stiffness": Amplitude("N m", 1e-5, 1e-6),
+        "stiffness": Amplitude(unit="N m", typical=1e-5, smallest=1e-6),
         "damping_time": Amplitude(
-            "s",
-            0.03,
+            unit="s",
+            typical=0.03,
             confounded_with=("fric.internal_bend", "air.linear"),
             cause="damp.bend",
             title="Damping of bending",
@@ -293,7 +293,8 @@ class _UniformPlate(NamedTuple):
     bound: np.ndarray
 
 
-@lru_cache(maxsize=8)  # as many as ``curvature_stencils`` caches: the power iteration takes longer than many a simulation
+# As many as ``curvature_stencils`` caches: the power iteration takes longer than many a simulation.
+@lru_cache(maxsize=8)
 def _uniform_plate(mesh: Mesh, poisson: float) -> _UniformPlate:
     stencils, area, share = curvature_stencils(mesh), mixed_area(mesh), mesh.vertex_area
     form = stencils.second @ np.linalg.cholesky(_isotropic_plate(poisson)) * np.sqrt(area)[:, None, None]

@@ -24,7 +24,11 @@ class BodyForce(AbstractEffect):
         InvalidInput: another shape, or a number that is not finite.
     """
 
-    amplitudes = {"acceleration": Amplitude("m/s^2", 1.0, 0.05, ("Gravity.acceleration", "air.wind"))}
+    amplitudes = {
+        "acceleration": Amplitude(
+            unit="m/s^2", typical=1.0, smallest=0.05, confounded_with=("Gravity.acceleration", "air.wind")
+        )
+    }
 
     def __init__(self, acceleration: Tensor) -> None:
         super().__init__()

@@ -36,8 +36,8 @@ class CreasingBending(Bending):
 
     amplitudes = {
         "mobility": Amplitude(
-            "1/s",
-            10.0,
+            unit="1/s",
+            typical=10.0,
             confounded_with=("rest.curl", "fric.internal_bend"),
             cause="plast.crease",
             title="Creases",

@@ -23,8 +23,8 @@ class MassDamping(AbstractEffect):
 
     amplitudes = {
         "rate": Amplitude(
-            "1/s",
-            1.0,
+            unit="1/s",
+            typical=1.0,
             confounded_with=("air.drag_n",),
             cause="air.linear",
             title="Linear damping",

@@ -33,8 +33,8 @@ class BendingFriction(AbstractEffect):
 
     amplitudes = {
         "moment": Amplitude(
-            "N",
-            2e-4,
+            unit="N",
+            typical=2e-4,
             confounded_with=("damp.bend", "plast.crease"),
             cause="fric.internal_bend",
             title="Internal friction in bending",
@@ -100,8 +100,8 @@ class ShearFriction(AbstractEffect):
 
     amplitudes = {
         "hysteresis": Amplitude(
-            "N/m",
-            1.0,
+            unit="N/m",
+            typical=1.0,
             confounded_with=("damp.kv",),
             cause="fric.internal_shear",
             title="Internal friction in shear",

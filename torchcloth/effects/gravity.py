@@ -26,10 +26,12 @@ class Gravity(AbstractEffect):
     """
 
     amplitudes = {
-        "acceleration": Amplitude("m/s^2", STANDARD_GRAVITY_M_PER_S2, 0.05, ("mass.density",)),
+        "acceleration": Amplitude(
+            unit="m/s^2", typical=STANDARD_GRAVITY_M_PER_S2, smallest=0.05, confounded_with=("mass.density",)
+        ),
         "tilt": Amplitude(
-            "rad",
-            0.01,
+            unit="rad",
+            typical=0.01,
             confounded_with=("air.wind", "obs.rotation"),
             signed=True,
             cause="env.gravity_tilt",

@@ -44,15 +44,15 @@ class GripSlip(AbstractEffect):
 
     amplitudes = {
         "mobility": Amplitude(
-            "m/(N s)",
-            0.01,
+            unit="m/(N s)",
+            typical=0.01,
             confounded_with=("rest.shrink", "obs.extrinsic"),
             cause="grip.slip",
             title="Slip in the grippers",
             description="The cloth creeps out of the grippers under a strong pull.",
             diagnosis_typical=0.05,
         ),
-        "hold": Amplitude("N", 1.0, 0.1),
+        "hold": Amplitude(unit="N", typical=1.0, smallest=0.1),
     }
     per_triangle = ()
 

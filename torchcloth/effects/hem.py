@@ -37,8 +37,8 @@ class LineMass(AbstractEffect):
 
     amplitudes = {
         "mass_per_length": Amplitude(
-            "kg/m",
-            4.5e-3,
+            unit="kg/m",
+            typical=4.5e-3,
             confounded_with=("mass.density", "env.gravity_tilt"),
             cause="mass.hem",
             title="Mass of a hem",

@@ -93,7 +93,11 @@ class ResidualForce(AbstractEffect):
         InvalidInput: no term, or one that does not exist.
     """
 
-    amplitudes = {"strength": Amplitude("of the law", 1.0, 0.1, ("air.drag_n", "air.linear", "damp.kv"))}
+    amplitudes = {
+        "strength": Amplitude(
+            unit="of the law", typical=1.0, smallest=0.1, confounded_with=("air.drag_n", "air.linear", "damp.kv")
+        )
+    }
 
     def __init__(self, terms: Mapping[str, float], gripped_vertices: Sequence[int] = ()) -> None:
         super().__init__()

@@ -21,8 +21,8 @@ class Coefficients(NamedTuple):
 
 
 _SHRINKAGE = Amplitude(
-    "-",
-    0.02,
+    unit="-",
+    typical=0.02,
     confounded_with=("mass.density", "grip.slip", "elas.ortho"),
     signed=True,
     cause="rest.shrink",
@@ -57,8 +57,8 @@ class RestShape(AbstractEffect):
         "shrink_warp": _SHRINKAGE,
         "shrink_weft": _SHRINKAGE,
         "skew": Amplitude(
-            "rad",
-            0.02,
+            unit="rad",
+            typical=0.02,
             confounded_with=("elas.ortho",),
             signed=True,
             cause="rest.skew",

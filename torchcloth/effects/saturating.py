@@ -41,7 +41,11 @@ class SaturatingBending(AbstractEffect):
         InvalidInput: values out of range.
     """
 
-    amplitudes = {"moment": Amplitude("N", 1e-3, 1e-4, ("Bending.stiffness", "fric.internal_bend"))}
+    amplitudes = {
+        "moment": Amplitude(
+            unit="N", typical=1e-3, smallest=1e-4, confounded_with=("Bending.stiffness", "fric.internal_bend")
+        )
+    }
     per_triangle = ()
 
     def __init__(self, moment: float | Tensor = 1e-3, curvature: float | Tensor = 2.0) -> None:

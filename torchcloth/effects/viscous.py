@@ -33,7 +33,9 @@ class KelvinVoigt(AbstractEffect):
         InvalidInput: negative viscosity.
     """
 
-    amplitudes = {"viscosity": Amplitude("N s/m", 1.0, 0.1, ("fric.internal_shear",))}
+    amplitudes = {
+        "viscosity": Amplitude(unit="N s/m", typical=1.0, smallest=0.1, confounded_with=("fric.internal_shear",))
+    }
     per_triangle = ("viscosity",)
 
     def __init__(self, viscosity: float | Tensor = 1.0) -> None:

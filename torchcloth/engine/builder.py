@@ -68,12 +68,12 @@ class StateField(NamedTuple):
     """A state variable of the program.
 
     Attributes:
-        now: field with its value at the start of the substep.
-        after: field with its value at the end.
+        start: field with its value at the start of the substep.
+        end: field with its value at the end.
     """
 
-    now: Field
-    after: Field
+    start: Field
+    end: Field
 
 
 class PrescribedFields(NamedTuple):
@@ -141,7 +141,7 @@ class SubstepBuilder:
         if state.x.dtype == torch.float32:
             self.compensation = StateField(*self.program.state(self.vertices, 3))
             zero = torch.zeros(self.vertices, 3, dtype=torch.float32, device=self.device)
-            self.inputs[self.compensation.now] = zero
+            self.inputs[self.compensation.start] = zero
         variables = {key: value for key, value in internal_variables(model, state).items() if key not in in_torch}
         self.memory = {key: StateField(*self.program.state(*value.shape[-2:])) for key, value in variables.items()}
         self.dt = self.program.per_substep(1)
@@ -175,7 +175,7 @@ class SubstepBuilder:
         return self._parameter_fields[id(tensor)]
 
     def number(self, value: float) -> Field:
-        """Return the field of a constant of a part."""
+        """Return a [1, 1] constant field that holds ``value``; kernels read it as they read a parameter."""
         return self.program.constant(np.array([[value]]))
 
     def loop(self, items: int) -> Loop:
@@ -239,7 +239,7 @@ class TriangleLoop:
 
     def __init__(self, builder: SubstepBuilder, velocity: Field | None = None, force: Field | None = None) -> None:
         self._builder = builder
-        self._velocity = builder.v.now if velocity is None else velocity
+        self._velocity = builder.v.start if velocity is None else velocity
         self._force = builder.force if force is None else force
         geometry = builder.model.geometry
         program = builder.program
@@ -251,17 +251,17 @@ class TriangleLoop:
 
     def parameter(self, tensor: Tensor) -> list[int]:
         """Return registers of a coefficient [..., E or 1, comps]."""
-        return self._once(f"parameter {id(tensor)}", lambda: self.loop.load(self._builder.parameter(tensor)))
+        return self._compute_once(f"parameter {id(tensor)}", lambda: self.loop.load(self._builder.parameter(tensor)))
 
     @property
     def x(self) -> list[list[int]]:
         """Registers of the corners' positions; in float32 relative to the first corner, as ``surface`` sees them."""
         builder = self._builder
-        positions = self._corner_registers("x", builder.x.now)
+        positions = self._corner_registers("x", builder.x.start)
         if builder.compensation is None:
             return positions
-        compensation = self._corner_registers("compensation", builder.compensation.now)
-        edges = self._once("edges", lambda: self.loop.call("compensated_edges", *positions, *compensation))
+        compensation = self._corner_registers("compensation", builder.compensation.start)
+        edges = self._compute_once("edges", lambda: self.loop.call("compensated_edges", *positions, *compensation))
         return [self.loop.load(builder.program.constant(np.zeros((1, 3)))), edges[:3], edges[3:]]
 
     @property
@@ -272,7 +272,7 @@ class TriangleLoop:
     @property
     def surface(self) -> list[int]:
         """Registers of f1, f2, cofactor1, cofactor2, n and J: 16 numbers."""
-        return self._once("surface", lambda: self.loop.call("surface", *self.x, self.shape))
+        return self._compute_once("surface", lambda: self.loop.call("surface", *self.x, self.shape))
 
     @property
     def normal(self) -> list[int]:
@@ -294,10 +294,10 @@ class TriangleLoop:
                 self.loop.add(self._forces[3 * k : 3 * k + 3], self._force, corner)
 
     def _corner_registers(self, name: str, field: Field) -> list[list[int]]:
-        flat = self._once(name, lambda: [r for c in self._builder.corners for r in self.loop.load(field, c)])
+        flat = self._compute_once(name, lambda: [r for c in self._builder.corners for r in self.loop.load(field, c)])
         return [flat[0:3], flat[3:6], flat[6:9]]
 
-    def _once(self, name: str, compute: Callable[[], list[int]]) -> list[int]:
+    def _compute_once(self, name: str, compute: Callable[[], list[int]]) -> list[int]:
         if name not in self._computed:
             self._computed[name] = compute()
         return self._computed[name]
@@ -315,10 +315,10 @@ class BendingLoop:
         program, near = builder.program, sheet.neighbours.cpu().numpy()
         derivatives = program.temporary(builder.vertices, 15)
         self._stress_field = program.temporary(builder.vertices, 15, is_recorded=False)
-        program.stencil(near, weight, builder.x.now, derivatives)
+        program.stencil(near, weight, builder.x.start, derivatives)
         remembers = any(key.startswith("effects.") for key in builder.memory)
         if builder.compensation is not None and remembers:  # an effect with memory would sum up rounding errors
-            program.stencil(near, weight, builder.compensation.now, derivatives)
+            program.stencil(near, weight, builder.compensation.start, derivatives)
         self.loop = builder.loop(builder.vertices)
         program.stencil(near, weight, builder.force, self._stress_field, StencilForm.TRANSPOSED)
         self._derivatives = self.loop.load(derivatives)
@@ -358,44 +358,46 @@ class VelocityStage:
 
     Attributes:
         loop: over the vertices, while the velocities are in registers.
-        now: registers of the velocities.
-        before: registers of the velocities before the present boundary.
+        velocities: registers of the velocities.
+        velocities_before: registers of the velocities before the present boundary.
         field: the velocities while they are in memory, for a boundary that changes few of them; else None.
     """
 
-    def __init__(self, builder: SubstepBuilder, loop: Loop, now: list[int]) -> None:
-        self._builder, self.loop, self.now, self.before = builder, loop, now, now
+    def __init__(self, builder: SubstepBuilder, loop: Loop, velocities: list[int]) -> None:
+        self._builder, self.loop, self.velocities, self.velocities_before = builder, loop, velocities, velocities
         self.field: Field | None = None
         self._has_drifted = False
 
-    def spill(self) -> Field:
+    def spill_to_field(self) -> Field:
         """End the loop and return a field with the velocities, for work that is not done vertex by vertex."""
-        field = self._store(self.now)
-        self._spilled_before = field if self.before == self.now else self._store(self.before)
+        field = self._store(self.velocities)
+        self._spilled_before = (
+            field if self.velocities_before == self.velocities else self._store(self.velocities_before)
+        )
         return field
 
-    def reload(self, field: Field) -> None:
+    def reload_from_field(self, field: Field) -> None:
         """Begin a new loop with the velocities of a field."""
         self.loop = self._builder.loop(self._builder.vertices)
-        self.now, self.before = self.loop.load(field), self.loop.load(self._spilled_before)
+        self.velocities, self.velocities_before = self.loop.load(field), self.loop.load(self._spilled_before)
 
     def to_field(self, drift: bool) -> Field:
         """Return a field with the velocities; ``drift``: they stay there, so the positions can follow at once."""
         if self.field is None and drift:
             self.drift()
-            self.field = self._builder.v.after
+            self.field = self._builder.v.end
         elif self.field is None:
-            self.before = self.now
-            self.field = self.spill()
+            self.velocities_before = self.velocities
+            self.field = self.spill_to_field()
         return self.field
 
     def to_registers(self) -> None:
         """Bring the velocities back into registers."""
         if self.field is not None:
-            self.reload(self.field)
+            self.reload_from_field(self.field)
             self.field = None
 
-    def scatter_rows(self, loop: Loop, rows: int, now: list[int]) -> None:
+    def scatter_rows(self, loop: Loop, rows: int, velocities: list[int]) -> None:
         """Replace the velocities of some rows of ``field``, from a loop over these.
 
         Raises:
@@ -403,27 +405,27 @@ class VelocityStage:
         """
         if self.field is None:
             raise ValueError("the velocities are in registers")
-        loop.store(now, self.field, rows)
+        loop.store(velocities, self.field, rows)
         if self._has_drifted:
-            self._drift_rows(loop, now, rows)
+            self._drift_rows(loop, velocities, rows)
 
     def drift(self) -> None:
         """Move the positions with the velocities; a second call does nothing."""
         if not self._has_drifted:
             self.to_registers()
-            self.loop.store(self.now, self._builder.v.after)
-            self._drift_rows(self.loop, self.now)
+            self.loop.store(self.velocities, self._builder.v.end)
+            self._drift_rows(self.loop, self.velocities)
             self._has_drifted = True
 
-    def _drift_rows(self, loop: Loop, now: list[int], rows: int | None = None) -> None:
+    def _drift_rows(self, loop: Loop, velocities: list[int], rows: int | None = None) -> None:
         builder = self._builder
-        inputs = loop.load(builder.dt), loop.load(builder.x.now, rows), now
+        inputs = loop.load(builder.dt), loop.load(builder.x.start, rows), velocities
         if builder.compensation is None:
-            loop.store(loop.call("drift", *inputs), builder.x.after, rows)
+            loop.store(loop.call("drift", *inputs), builder.x.end, rows)
             return
-        result = loop.call("drift_compensated", *inputs, loop.load(builder.compensation.now, rows))
-        loop.store(result[:3], builder.x.after, rows)
-        loop.store(result[3:], builder.compensation.after, rows)
+        result = loop.call("drift_compensated", *inputs, loop.load(builder.compensation.start, rows))
+        loop.store(result[:3], builder.x.end, rows)
+        loop.store(result[3:], builder.compensation.end, rows)
 
     def _store(self, regs: list[int]) -> Field:
         field = self._builder.program.temporary(self._builder.vertices, 3)

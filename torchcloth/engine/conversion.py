@@ -22,9 +22,9 @@ def state_tensors(state: ClothState) -> dict[str, Tensor]:
 def state_inputs(builder: SubstepBuilder, state: ClothState, compensation: Tensor | None = None) -> dict[Field, Tensor]:
     """Return the state's tensors by field, with the compensation of the positions where there is one."""
     tensors = state_tensors(state)
-    inputs = {field.now: tensors[name] for name, field in builder.state_fields.items()}
+    inputs = {field.start: tensors[name] for name, field in builder.state_fields.items()}
     if builder.compensation is not None and compensation is not None:
-        inputs[builder.compensation.now] = compensation
+        inputs[builder.compensation.start] = compensation
     return inputs
 
 
@@ -50,7 +50,7 @@ def flatten_batch(
         trailing: axes that stay.
     """
     flat, scenes = {}, batch.numel()
-    states = {field.now for field in builder.state_fields.values()}
+    states = {field.start for field in builder.state_fields.values()}
     for field, t in tensors.items():
         leading, rest = t.shape[:-trailing], t.shape[-trailing:]
         differs = leading.numel() > 1 or (scenes > 1 and field in states)
@@ -71,10 +71,10 @@ def unflatten_results(
         batch: shape of the scenes.
     """
     shaped = {f: t.reshape(*batch, *t.shape[1:]) for f, t in results.items()}
-    after = {name: shaped[field.after] for name, field in builder.state_fields.items()}
+    after = {name: shaped[field.end] for name, field in builder.state_fields.items()}
     impulses = {name: shaped[f].squeeze(-2) for name, f in builder.impulses.items()}
     compensation = None
     if builder.compensation is not None:
-        compensation = shaped[builder.compensation.after].detach()  # it has no derivative
+        compensation = shaped[builder.compensation.end].detach()  # it has no derivative
     x, v, d3 = after.pop("x"), after.pop("v"), after.pop("d3", before.d3)
     return ClothState(x, v, d3, before.memory | after), compensation, impulses

@@ -150,7 +150,7 @@ class GraphedRollout:
     @property
     def max_displacement_m(self) -> float:
         """Displacement of a vertex [m] beyond which layers may meet that the last search did not list."""
-        return 0.0 if self.model.grid is None else self.model.grid.skin / 2
+        return 0.0 if self.model.grid is None else self.model.grid.search_skin / 2
 
     def _own_tensor(self, tensor: Tensor) -> Tensor:
         """What stands for a tensor of the model, in memory of its own: the cloth may be changed later."""

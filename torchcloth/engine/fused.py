@@ -7,7 +7,7 @@ from functools import partial
 
 import torch
 from torch import Tensor
-from torch.utils.checkpoint import checkpoint as recompute
+from torch.utils import checkpoint as torch_checkpoint
 
 from .._utils.torch_modes import under_torch_transform
 from ..boundaries import PrescribedMotion
@@ -81,7 +81,9 @@ class FusedEngine:
             chunk = range(begin, min(begin + SUBSTEPS_PER_CHECKPOINT, last))
             run = partial(self._run_with_torch, parts, dt, fixed, rows, chunk)
             if recomputes:
-                state, compensation, impulses = recompute(run, state, compensation, use_reentrant=False)
+                state, compensation, impulses = torch_checkpoint.checkpoint(
+                    run, state, compensation, use_reentrant=False
+                )
             else:
                 state, compensation, impulses = run(state, compensation)
             total = add_impulses(total, impulses)
@@ -129,7 +131,7 @@ class FusedEngine:
     @property
     def rounding(self) -> Field | None:
         """The result with the compensation in float32, which has no significant digits; None in float64."""
-        return None if self.builder.compensation is None else self.builder.compensation.after
+        return None if self.builder.compensation is None else self.builder.compensation.end
 
     def is_plain(self, state: ClothState, motion: Mapping[str, Trajectory]) -> bool:
         """Return whether the engine runs by itself, on numbers of which nobody wants a derivative."""

@@ -16,6 +16,7 @@ from ..errors import InvalidInput
 from .enums import ITEM_ROW, SINGLE_ROW, TRANSFER_SHARES, Opcode, TransferBasis
 from .fields import Field
 from .library import kernels
+from .stages import RecordingApi
 
 LOOKUP_REGISTERS = 11  # three fractions of a cell, and the values at its eight corners
 
@@ -136,8 +137,8 @@ class Loop:
         self._registers += count
         return list(range(self._registers - count, self._registers))
 
-    def emit(self, handle, api) -> None:
-        """Record the calls of the library that build the loop."""
+    def emit(self, handle: object, api: RecordingApi) -> None:
+        """Append the loop, with its kernels and moves, to the program that the library builds."""
         needed = self._registers_of_reverse_sweep()
         counted = int(self._contact_count)
         api("loop")(handle, self.items, self._point_list, counted, int(self.no_derivative), int(self.is_replayed))

@@ -52,7 +52,7 @@ def lower(
         contact.add_forces()
 
     # velocities, boundaries, positions, directors
-    velocity = _kick(builder)
+    velocity = _append_kick(builder)
     lower_boundaries(builder, velocity)
     velocity.drift()
     if contact is not None:
@@ -76,12 +76,12 @@ def _lower_effect(builder: SubstepBuilder, name: str, effect, c) -> None:
     lower_it(builder, name, effect, c)
 
 
-def _kick(builder: SubstepBuilder) -> VelocityStage:
+def _append_kick(builder: SubstepBuilder) -> VelocityStage:
     loop, v = lower_viscous_stages(builder)
     dt, force, mass = (loop.load(field) for field in (builder.dt, builder.force, builder.mass))
     for kernel, fields in builder.vertex_forces:
         loop.call(kernel, *(loop.load(field) for field in fields), into=force)
     if builder.added_mass is None:
         return VelocityStage(builder, loop, loop.call("kick", dt, v, force, mass))
-    after = loop.call("kick_added_mass", dt, v, force, mass, loop.load(builder.added_mass))
-    return VelocityStage(builder, loop, after)
+    velocities = loop.call("kick_added_mass", dt, v, force, mass, loop.load(builder.added_mass))
+    return VelocityStage(builder, loop, velocities)

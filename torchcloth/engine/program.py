@@ -81,9 +81,9 @@ class Program:
 
     def state(self, rows: int, comps: int) -> tuple[Field, Field]:
         """Return the fields of a state variable at the start and at the end of the substep."""
-        now, after = self._field(FieldKind.STATE, rows, comps), self._field(FieldKind.NEXT, rows, comps)
-        self._api("next_state")(self._handle, now.id, after.id)
-        return now, after
+        start, end = self._field(FieldKind.STATE, rows, comps), self._field(FieldKind.NEXT, rows, comps)
+        self._api("next_state")(self._handle, start.id, end.id)
+        return start, end
 
     def temporary(self, rows: int, comps: int, is_recorded: bool = True) -> Field:
         """Return a field that is zero at the start of a substep.

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
 
 from .enums import PATCH_TRIANGLES, StencilForm
 from .fields import Field
+
+RecordingApi = Callable[[str], Callable[..., int]]
+"""Name of a function of the library -> stand-in that records its arguments; ``handle`` is the first of these."""
 
 
 class ContactSearch(NamedTuple):
@@ -17,8 +20,8 @@ class ContactSearch(NamedTuple):
     Attributes:
         fields: positions, lowest node of each point, fields of the nodes, fields of the points.
         corners: [3, E] int32, vertices of the triangles.
-        places: [S, 3] float64, barycentric coordinates of a triangle's contact points.
-        lengths: (spacing, skin, reach) of the grid [m].
+        barycentric: [S, 3] float64, barycentric coordinates of a triangle's contact points.
+        lengths: (spacing, search skin, reach) of the grid [m].
         search_interval: substeps after which the search is repeated in any case.
         order: [E] int32, triangles patch by patch.
         patch_starts: [patches + 1] int32; [1] where all triangles are always active.
@@ -28,7 +31,7 @@ class ContactSearch(NamedTuple):
 
     fields: Sequence[Field]
     corners: np.ndarray
-    places: np.ndarray
+    barycentric: np.ndarray
     lengths: tuple[float, float, float]
     search_interval: int
     order: np.ndarray
@@ -36,16 +39,16 @@ class ContactSearch(NamedTuple):
     patches_may_meet: np.ndarray
     non_adjacent: np.ndarray
 
-    def emit(self, handle, api) -> None:
-        """Record the call of the library that builds the stage."""
+    def emit(self, handle: object, api: RecordingApi) -> None:
+        """Append the search to the program that the library builds."""
         ids = tuple(field.id for field in self.fields)
         limits = (self.search_interval, len(self.patch_starts) - 1, PATCH_TRIANGLES)
-        sizes = self.corners.shape[1], len(self.places)
+        sizes = self.corners.shape[1], len(self.barycentric)
         lengths = np.array(self.lengths, np.float64)
         patches = (self.order, self.patch_starts, self.patches_may_meet, self.non_adjacent)
         search = (np.ascontiguousarray(a) for a in patches)
-        corners, places = np.ascontiguousarray(self.corners), np.ascontiguousarray(self.places)
-        api("contact_search")(handle, ids, len(ids), corners, sizes[0], places, sizes[1], lengths, limits, *search)
+        corners, barycentric = np.ascontiguousarray(self.corners), np.ascontiguousarray(self.barycentric)
+        api("contact_search")(handle, ids, len(ids), corners, sizes[0], barycentric, sizes[1], lengths, limits, *search)
 
 
 class GridVelocity(NamedTuple):
@@ -63,8 +66,8 @@ class GridVelocity(NamedTuple):
     velocity: Field
     min_mass: float
 
-    def emit(self, handle, api) -> None:
-        """Record the call of the library that builds the stage."""
+    def emit(self, handle: object, api: RecordingApi) -> None:
+        """Append the division to the program that the library builds."""
         api("grid_velocity")(handle, self.mass.id, self.momentum.id, self.velocity.id, self.min_mass)
 
 
@@ -86,7 +89,7 @@ class PointBroadPhase(NamedTuple):
     """List of the sample points that may touch a body; see ``Program.broad_phase``.
 
     Attributes:
-        number: of the list.
+        list_number: number of the list that the broad phase fills.
         x: [V, 3] positions [m].
         approach: [V, 2] distance to the body [m] and speed relative to it [m/s].
         dt: substep [s].
@@ -94,17 +97,17 @@ class PointBroadPhase(NamedTuple):
         lipschitz: Lipschitz constant of the body's distance function.
     """
 
-    number: int
+    list_number: int
     x: Field
     approach: Field
     dt: Field
     points: PointTables
     lipschitz: float
 
-    def emit(self, handle, api) -> None:
-        """Record the call of the library that builds the stage."""
+    def emit(self, handle: object, api: RecordingApi) -> None:
+        """Append the broad phase to the program that the library builds."""
         fields = (self.x.id, self.approach.id, self.dt.id)
-        api("broad_phase")(handle, self.number, *fields, *self.points, self.lipschitz)
+        api("broad_phase")(handle, self.list_number, *fields, *self.points, self.lipschitz)
 
 
 class Stencil(NamedTuple):
@@ -124,6 +127,6 @@ class Stencil(NamedTuple):
     y: Field
     form: StencilForm
 
-    def emit(self, handle, api) -> None:
-        """Record the call of the library that builds the stage."""
+    def emit(self, handle: object, api: RecordingApi) -> None:
+        """Append the operator to the program that the library builds."""
         api("stencil")(handle, self.table, self.weight.id, self.x.id, self.y.id, int(self.form))

@@ -32,10 +32,14 @@ def print_tension_prediction(prediction: TensionPrediction) -> None:
     columns = ["mm", "strain", "force N", "by parameters", "by the misfit", "by the setup", "95 % interval"]
     for heading in columns + (["lateral strain", "95 % interval"] if lateral else []):
         table.add_column(heading, justify="right")
-    order, least = np.argsort(t.displacement, kind="stable"), 1e-6 * np.abs(prediction.force.value).max()
+    order = np.argsort(t.displacement, kind="stable")
+    min_printed_n = MIN_RELATIVE_PART * np.abs(prediction.force.value).max()
     for i in order[np.linspace(0, len(t) - 1, min(MAX_PRINTED_ROWS, len(t))).round().astype(int)]:
         f = prediction.force
-        parts = [f"± {part[i] if part[i] > least else 0:.2g}" for part in (f.parameter_std, f.misfit_std, f.setup_std)]
+        parts = [
+            f"± {part[i] if part[i] > min_printed_n else 0:.2g}"
+            for part in (f.parameter_std, f.misfit_std, f.setup_std)
+        ]
         cells = [f"{1e3 * t.displacement[i]:.3g}", f"{t.strain[i]:.4f}", f"{f.value[i]:.4g}", *parts, _interval(f, i)]
         if lateral:
             cells += [f"{lateral.value[i]:.4f}", _interval(lateral, i)]

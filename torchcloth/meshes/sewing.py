@@ -54,13 +54,21 @@ class Drawing:
 
 @dataclass(frozen=True)
 class _Flat:
-    """Both halves of one layer."""
+    """Both halves of one layer.
 
-    points: np.ndarray  # [N, 2] m
-    faces: np.ndarray  # [F, 3] counter-clockwise
-    panel: np.ndarray  # [F]
-    warp: np.ndarray  # [P, 2] unit, of each panel
-    on: dict[tuple[str, str], np.ndarray]  # (side, curve) -> points in order
+    Attributes:
+        points: [N, 2] m.
+        faces: [F, 3] counter-clockwise.
+        panel: [F], panel of each triangle.
+        warp: [P, 2] unit vectors, warp of each panel.
+        curve_points: (side, curve) -> numbers of its points in order.
+    """
+
+    points: np.ndarray
+    faces: np.ndarray
+    panel: np.ndarray
+    warp: np.ndarray
+    curve_points: dict[tuple[str, str], np.ndarray]
 
 
 def sew(drawing: Drawing, triangles: int, gap: float) -> Mesh:
@@ -74,17 +82,20 @@ def sew(drawing: Drawing, triangles: int, gap: float) -> Mesh:
     flat = _flatten(drawing, triangles)
     sewn = {name for name, curve in drawing.curves.items() if curve.kind == "sewn"}
     shared = np.zeros(len(flat.points), bool)
-    for (_, name), index in flat.on.items():
+    for (_, name), index in flat.curve_points.items():
         shared[index] |= name in sewn
-    behind = np.where(shared, np.arange(len(shared)), len(shared) + np.cumsum(~shared) - 1)
-    faces = np.vstack([flat.faces, behind[flat.faces][:, ::-1]])
+    # back_vertex[i]: number of the back layer's vertex behind vertex i of the front layer; at seams both are one
+    back_vertex = np.where(shared, np.arange(len(shared)), len(shared) + np.cumsum(~shared) - 1)
+    faces = np.vstack([flat.faces, back_vertex[flat.faces][:, ::-1]])
     if (topology.find_edges(faces)[1] > 2).any():
         raise InvalidInput("triangles", got=triangles, expected="more, for these measures: a part is one triangle wide")
-    lift = _lift(flat, sewn, gap)
-    front = np.column_stack([flat.points, lift])
+    heights = _layer_heights(flat, sewn, gap)
+    front = np.column_stack([flat.points, heights])
     vertices = np.vstack([front, (front * [1.0, 1.0, -1.0])[~shared]])
     vertices[:, :2] -= (vertices[:, :2].min(0) + vertices[:, :2].max(0)) / 2
-    return Mesh.build(vertices, faces, _pattern(flat), _places(drawing, flat, behind)).renumber_along_longest_side()
+    return Mesh.build(
+        vertices, faces, _lay_out_pattern(flat), _named_vertices(drawing, flat, back_vertex)
+    ).renumber_along_longest_side()
 
 
 def _flatten(drawing: Drawing, triangles: int) -> _Flat:
@@ -94,15 +105,15 @@ def _flatten(drawing: Drawing, triangles: int) -> _Flat:
     area = _check_drawing(drawing)
     edge, halves = (4 * area / triangles / (0.75**0.5 / 2)) ** 0.5, []
     for _ in range(MAX_EDGE_LENGTH_TRIALS):
-        halves.append(_half(drawing, edge))
+        halves.append(_triangulate_half(drawing, edge))
         count = 4 * len(halves[-1].faces)
         if abs(count / triangles - 1) < TRIANGLE_COUNT_TOLERANCE:
             break
         edge *= (count / triangles) ** 0.5
-    return _mirrored(drawing, min(halves, key=lambda half: abs(4 * len(half.faces) - triangles)))
+    return _mirror(drawing, min(halves, key=lambda half: abs(4 * len(half.faces) - triangles)))
 
 
-def _half(drawing: Drawing, edge: float) -> _Flat:
+def _triangulate_half(drawing: Drawing, edge: float) -> _Flat:
     """Triangulate the half that is drawn, and join its pieces."""
     samples = {name: sample_polyline(curve.points, edge) for name, curve in drawing.curves.items()}
     parts, faces, panel, start = [], [], [], 0
@@ -114,13 +125,13 @@ def _half(drawing: Drawing, edge: float) -> _Flat:
         panel += [number] * len(inside)
         start += len(points)
     points, index = _weld(np.vstack(parts))
-    on = {("right", name): _find(points, samples[name]) for name in samples}
+    curve_points = {("right", name): _find(points, samples[name]) for name in samples}
     warp = np.array([piece.warp for piece in drawing.pieces.values()])
     warp /= np.linalg.norm(warp, axis=1, keepdims=True)
-    return _Flat(points, index[np.vstack(faces)], np.array(panel), warp, on)
+    return _Flat(points, index[np.vstack(faces)], np.array(panel), warp, curve_points)
 
 
-def _mirrored(drawing: Drawing, half: _Flat) -> _Flat:
+def _mirror(drawing: Drawing, half: _Flat) -> _Flat:
     """Return both halves, welded on the middle line; a piece with a fold is one panel, others become two."""
     flip = np.array([-1.0, 1.0])
     points, index = _weld(np.vstack([half.points, half.points * flip]))
@@ -129,18 +140,18 @@ def _mirrored(drawing: Drawing, half: _Flat) -> _Flat:
         any(drawing.curves[c.removeprefix("-")].kind == "fold" for c in p.curves) for p in drawing.pieces.values()
     ]
     other = np.where(np.array(folded)[half.panel], half.panel, half.panel + len(folded))
-    on = {("right", name): right[i] for (_, name), i in half.on.items()}
-    on |= {("left", name): left[i] for (_, name), i in half.on.items()}
+    curve_points = {("right", name): right[i] for (_, name), i in half.curve_points.items()}
+    curve_points |= {("left", name): left[i] for (_, name), i in half.curve_points.items()}
     return _Flat(
         points,
         np.vstack([right[half.faces], left[half.faces][:, ::-1]]),
         np.concatenate([half.panel, other]),
         np.vstack([half.warp, half.warp * flip]),
-        on,
+        curve_points,
     )
 
 
-def _pattern(flat: _Flat) -> np.ndarray:
+def _lay_out_pattern(flat: _Flat) -> np.ndarray:
     """Return the pattern [2 F, 3, 2] m: panels next to each other as they are cut, outer side up, warp along u."""
     layers, start = [], 0.0
     for side, order in ((1.0, [0, 1, 2]), (-1.0, [2, 1, 0])):
@@ -156,31 +167,34 @@ def _pattern(flat: _Flat) -> np.ndarray:
     return np.concatenate(layers)
 
 
-def _lift(flat: _Flat, sewn: set[str], gap: float) -> np.ndarray:
+def _layer_heights(flat: _Flat, sewn: set[str], gap: float) -> np.ndarray:
     """Return the height of the front layer, [N] m: 0 at seams, half the gap far from them."""
     if gap == 0:
         return np.zeros(len(flat.points))
-    seams = [flat.points[index] for (_, name), index in flat.on.items() if name in sewn]
+    seams = [flat.points[index] for (_, name), index in flat.curve_points.items() if name in sewn]
     distance = np.min([distance_to_path(flat.points, seam) for seam in seams], axis=0)
     return gap / 2 * np.minimum(1.0, distance / (LIFT_RAMP_GAPS * gap))
 
 
-def _places(drawing: Drawing, flat: _Flat, behind: np.ndarray) -> dict[str, np.ndarray]:
+def _named_vertices(drawing: Drawing, flat: _Flat, back_vertex: np.ndarray) -> dict[str, np.ndarray]:
     """Return corners, openings and seams by name; those that meet their mirror image are one, also by layer."""
     out = {}
     for name, (curve, end) in drawing.corners.items():
-        out |= {f"{side} {name}": flat.on[side, curve][[end]] for side in ("left", "right")}
+        out |= {f"{side} {name}": flat.curve_points[side, curve][[end]] for side in ("left", "right")}
     for curve, drawn in drawing.curves.items():
         name = curve if drawn.kind == "open" else f"{curve} seam"
-        left, right = flat.on["left", curve], flat.on["right", curve]
+        left, right = flat.curve_points["left", curve], flat.curve_points["right", curve]
         if drawn.kind == "fold":
             continue
         if drawn.kind != "sewn" and len(np.intersect1d(left, right)):
-            both = np.union1d(left, right)
-            out |= {name: np.union1d(both, behind[both])}
-            out |= {f"{name} front": both, f"{name} back": np.unique(behind[both])}
+            both_sides = np.union1d(left, right)
+            out |= {name: np.union1d(both_sides, back_vertex[both_sides])}
+            out |= {f"{name} front": both_sides, f"{name} back": np.unique(back_vertex[both_sides])}
         else:
-            out |= {f"left {name}": np.union1d(left, behind[left]), f"right {name}": np.union1d(right, behind[right])}
+            out |= {
+                f"left {name}": np.union1d(left, back_vertex[left]),
+                f"right {name}": np.union1d(right, back_vertex[right]),
+            }
     return out
 
 
@@ -189,7 +203,7 @@ def _check_drawing(drawing: Drawing) -> float:
     from matplotlib.path import Path
 
     outlines = {
-        name: np.vstack([_directed(drawing, c) for c in piece.curves]) for name, piece in drawing.pieces.items()
+        name: np.vstack([_directed_curve(drawing, c) for c in piece.curves]) for name, piece in drawing.pieces.items()
     }
     areas = {name: _area(outline) for name, outline in outlines.items()}
     for name, outline in outlines.items():
@@ -209,7 +223,7 @@ def _check_drawing(drawing: Drawing) -> float:
     return sum(areas.values())
 
 
-def _directed(drawing: Drawing, name: str) -> np.ndarray:
+def _directed_curve(drawing: Drawing, name: str) -> np.ndarray:
     """Return a piece's curve in its direction, without the last point, which is the next curve's first."""
     points = drawing.curves[name.removeprefix("-")].points
     return points[::-1][:-1] if name[0] == "-" else points[:-1]

@@ -75,26 +75,31 @@ def _edges(mesh: Mesh) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _hinges(mesh: Mesh, x: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Bending equations of neighbouring triangles abc and bad.
+    """Return the bending equations of neighbouring triangles abc and bad.
 
-    Returns corners a, b, c, d [N, 4], weights [N, 4] 1/m of their angle, and its standard deviation [N] rad. The angle
-    is the distance of d from the plane of abc over its height above the edge ab. Shapes come from ``rest``.
+    The angle is the distance of d from the plane of abc over its height above the edge ab. Shapes come from ``rest``.
+
+    Returns:
+        Corners a, b, c, d [N, 4], weights [N, 4] 1/m of the angle, and its standard deviation [N] rad.
     """
-    half: dict[tuple[int, int], tuple[int, float, float]] = {}
+    # edge (a, b) -> opposite corner c, foot of its height as a fraction of the edge from a, height [m]
+    opposite: dict[tuple[int, int], tuple[int, float, float]] = {}
     for face, rest in zip(mesh.faces.tolist(), mesh.rest, strict=True):
         for k in range(3):
             edge, rim = rest[(k + 1) % 3] - rest[k], rest[(k + 2) % 3] - rest[k]
             length = float(np.linalg.norm(edge))
-            along, height = float(rim @ edge) / length**2, float(edge[0] * rim[1] - edge[1] * rim[0]) / length
-            half[face[k], face[(k + 1) % 3]] = (face[(k + 2) % 3], along, height)
+            foot, height = float(rim @ edge) / length**2, float(edge[0] * rim[1] - edge[1] * rim[0]) / length
+            opposite[face[k], face[(k + 1) % 3]] = (face[(k + 2) % 3], foot, height)
     corners, weights, angle = [], [], []
-    for (a, b), (c, t, h) in half.items():
-        if a < b and (b, a) in half:
-            d, s, g = half[b, a]
-            s = 1 - s
+    for (a, b), (c, foot_c, height_c) in opposite.items():
+        if a < b and (b, a) in opposite:
+            d, foot_d, height_d = opposite[b, a]
+            foot_d = 1 - foot_d  # from a, as foot_c
             corners.append((a, b, c, d))
-            weights.append(((s - 1) / g + (t - 1) / h, -s / g - t / h, 1 / h, 1 / g))
-            angle.append(CURVATURE_STD_PER_M * (h + g) / 3)
+            weight_a = (foot_d - 1) / height_d + (foot_c - 1) / height_c
+            weight_b = -foot_d / height_d - foot_c / height_c
+            weights.append((weight_a, weight_b, 1 / height_c, 1 / height_d))
+            angle.append(CURVATURE_STD_PER_M * (height_c + height_d) / 3)
     if not corners:
         return np.zeros((0, 4), int), np.zeros((0, 4)), np.zeros(0)
     vertices, coefficients, std = np.array(corners), np.array(weights), np.array(angle)

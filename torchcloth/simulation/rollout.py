@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import torch
 from torch import Tensor
-from torch.utils.checkpoint import checkpoint as recompute
+from torch.utils import checkpoint as torch_checkpoint
 
 from .._utils.torch_modes import under_torch_transform
 from ..boundaries import PrescribedMotion, sample_trajectory
@@ -135,7 +135,7 @@ class RolloutSchedule(NamedTuple):
         ``current_state`` returns the state at the start of the next interval.
         """
         prescribed, first = self.sample_motion(), 0
-        for interval in self._bare_intervals():
+        for interval in self._list_intervals():
             last = first + interval.count
             needed, span = 0, interval.end - interval.start
             if self.step_for is not None:
@@ -155,7 +155,7 @@ class RolloutSchedule(NamedTuple):
         if self.choice.fused is not None and self.choice.fused.is_on_device:
             vertices //= SCENES_PER_DEVICE
         max_substeps = MAX_VERTEX_SUBSTEPS_PER_CALL // max(vertices, MIN_COUNTED_VERTICES)
-        for interval in (*self._bare_intervals(), None):
+        for interval in (*self._list_intervals(), None):
             if block and (interval is None or last - first + interval.count > max_substeps):
                 yield block, _slice(prescribed, first, last)
                 first, block = last, []
@@ -178,11 +178,12 @@ class RolloutSchedule(NamedTuple):
 
     def sample_motion(self) -> dict[str, PrescribedMotion]:
         """Sample the motion on all substeps at once, which costs what one interval does."""
-        intervals = self._bare_intervals()
+        intervals = self._list_intervals()
         times = torch.cat([*(i.substep_times()[:-1] for i in intervals), intervals[-1].substep_times()[-1:]])
         return _sample(self.motion, times)
 
-    def _bare_intervals(self) -> list[FrameInterval]:
+    def _list_intervals(self) -> list[FrameInterval]:
+        """Return the intervals between frames, whose motion is not yet sampled."""
         return [
             FrameInterval(self.model, self.motion, start, end, count, self.choice.fused, None, self.graphs)
             for (start, end), count in zip(pairwise(self.frames), self.counts, strict=True)
@@ -290,8 +291,8 @@ def _run_reference(
     checkpoint: bool,
 ) -> tuple[ClothState, Tensor | None, Impulses]:
     total: Impulses = {}
-    recomputed = checkpoint and may_recompute()
-    model = freeze_parameters(interval.model) if recomputed else interval.model
+    recomputes = checkpoint and may_recompute()
+    model = freeze_parameters(interval.model) if recomputes else interval.model
     graphs = None if under_torch_transform() else interval.graphs
     chunk = segment_length(interval.count) if graphs is not None and graphs.is_enabled else SUBSTEPS_PER_CHECKPOINT
     for first in range(0, interval.count, chunk):
@@ -304,8 +305,8 @@ def _run_reference(
         result = None if graphs is None else graphs.rollout_segment(state, compensation, **segment)
         if result is None:
             run = partial(substep.rollout_segment, model, **segment)
-            if recomputed:
-                result = recompute(run, state, compensation, use_reentrant=False)
+            if recomputes:
+                result = torch_checkpoint.checkpoint(run, state, compensation, use_reentrant=False)
             else:
                 result = run(state, compensation)
         state, compensation, impulses = result

@@ -63,17 +63,18 @@ def linearise(
         shifts: (coordinate, step) of the shifted points, with a column each; None: central differences along each
             coordinate.
     """
-    keep_shifts, shifts = shifts is not None, central_steps(model) if shifts is None else list(shifts)
+    has_column_per_shift = shifts is not None
+    shifts = central_steps(model) if shifts is None else list(shifts)
     n_shifts = len(shifts)
     worlds = WorldCache(model, shifts, data.fine_mesh and data.fine_mesh.base, data.recent_frames)
 
-    def simulate(k: int, asked: list[Hypothesis]) -> EpisodeEvidence:
+    def simulate(k: int, requested: list[Hypothesis]) -> EpisodeEvidence:
         nuisances = None if before is None else _nuisance_slopes(before, k)
-        question = [k, [h.name for h in model.accepted], _identify(asked), shifts, *(nuisances or ())]
-        return data.cache(question, model.point, partial(simulate_episode, worlds, data, k, asked, nuisances))
+        cache_key = [k, [h.name for h in model.accepted], _identify(requested), shifts, *(nuisances or ())]
+        return data.cache(cache_key, model.point, partial(simulate_episode, worlds, data, k, requested, nuisances))
 
-    asked = _without_equivalents(model, hypotheses)
-    results, possible = _simulate_all(data, _with_opposites(asked), progress, simulate)
+    requested = _drop_equivalents(model, hypotheses)
+    results, possible = _simulate_all(data, _add_opposites(requested), progress, simulate)
     bins, nuisance_stds, mesh_differences = [], [], []
     for k, (evidence, simulated) in enumerate(results):
         columns = [*range(n_shifts), *(n_shifts + i for i, h in enumerate(simulated) if h in possible)]
@@ -81,12 +82,12 @@ def linearise(
         smooth = ~torch.isin(evidence.bins.key, data.bifurcating_bins[k]) if data.bifurcating_bins else slice(None)
         selected = evidence.bins.select(smooth)
         selected = selected._replace(jacobian=selected.jacobian[:, columns])
-        bins.append(selected if keep_shifts else central_differences(selected, shifts, len(model.parameters)))
+        bins.append(selected if has_column_per_shift else central_differences(selected, shifts, len(model.parameters)))
         mesh_differences.append(evidence.mesh_difference[smooth])
         nuisance_stds.append(evidence.nuisance_stds)
-    n_coordinates = n_shifts if keep_shifts else len(model.point)
+    n_coordinates = n_shifts if has_column_per_shift else len(model.point)
     result = Linearisation(bins, n_coordinates, possible, nuisance_stds, mesh_differences)
-    return _append_equivalents(_antisymmetric_slopes(result, asked), model, hypotheses)
+    return _append_equivalents(_average_opposite_slopes(result, requested), model, hypotheses)
 
 
 def linearise_hypotheses(
@@ -107,38 +108,38 @@ def linearise_hypotheses(
     """
     worlds = WorldCache(model, (), data.fine_mesh and data.fine_mesh.base, data.recent_frames)
 
-    def simulate(k: int, asked: list[Hypothesis]) -> EpisodeEvidence:
-        question = [k, "asked", [h.name for h in model.accepted], _identify(asked)]
-        return data.cache(question, model.point, partial(simulate_hypotheses, worlds, data, k, asked))
+    def simulate(k: int, requested: list[Hypothesis]) -> EpisodeEvidence:
+        cache_key = [k, "asked", [h.name for h in model.accepted], _identify(requested)]
+        return data.cache(cache_key, model.point, partial(simulate_hypotheses, worlds, data, k, requested))
 
-    asked = _without_equivalents(model, hypotheses)
-    results, possible = _simulate_all(data, _with_opposites(asked), progress, simulate)
+    requested = _drop_equivalents(model, hypotheses)
+    results, possible = _simulate_all(data, _add_opposites(requested), progress, simulate)
     bins = []
     for b, stds, (evidence, simulated) in zip(here.bins, here.nuisance_stds, results, strict=True):
         columns = [i for i, h in enumerate(simulated) if h in possible]
         slopes = align_rows(b.key, evidence.bins.key, evidence.bins.jacobian[:, columns])
         parts = [b.jacobian[:, : here.n_coordinates], slopes, b.jacobian[:, b.jacobian.shape[1] - len(stds) :]]
         bins.append(b._replace(jacobian=torch.cat(parts, 1)))
-    result = _antisymmetric_slopes(replace(here, bins=bins, hypotheses=possible), asked)
+    result = _average_opposite_slopes(replace(here, bins=bins, hypotheses=possible), requested)
     return _append_equivalents(result, model, hypotheses)
 
 
-def _without_equivalents(model: WorldModel, hypotheses: Sequence[Hypothesis]) -> list[Hypothesis]:
+def _drop_equivalents(model: WorldModel, hypotheses: Sequence[Hypothesis]) -> list[Hypothesis]:
     """Return the hypotheses that equal no parameter of the model."""
     parameters = {p.name for p in model.parameters}
     return [h for h in hypotheses if h.equivalent_parameter not in parameters]
 
 
-def _with_opposites(hypotheses: Sequence[Hypothesis]) -> list[Hypothesis]:
+def _add_opposites(hypotheses: Sequence[Hypothesis]) -> list[Hypothesis]:
     """Add the opposite of a hypothesis that implies another one: the implied one is the same both ways."""
     both = [h for h in hypotheses if h.implies and h.opposite.typical == -h.typical]
     return [*hypotheses, *(h.opposite for h in both if h.opposite not in hypotheses)]
 
 
-def _antisymmetric_slopes(result: Linearisation, asked: Sequence[Hypothesis]) -> Linearisation:
+def _average_opposite_slopes(result: Linearisation, requested: Sequence[Hypothesis]) -> Linearisation:
     """Average the slopes of both ways: drag, which wind implies, would otherwise brake one way only."""
     hypotheses, n = result.hypotheses, result.n_coordinates
-    indices = [k for k, h in enumerate(hypotheses) if h in asked]
+    indices = [k for k, h in enumerate(hypotheses) if h in requested]
     pairs = [
         [k, *(j for j, h in enumerate(hypotheses) if hypotheses[k].implies and h == hypotheses[k].opposite)]
         for k in indices
@@ -183,15 +184,15 @@ def _simulate_all(
 
     Episodes overlap: while bins of one are computed, others are simulated.
     """
-    asked, results, start, count = list(hypotheses), [], time.monotonic(), len(data.episodes)
-    with closing(iterate_parallel(lambda k: simulate(k, asked), range(count))) as episodes:
+    requested, results, start, count = list(hypotheses), [], time.monotonic(), len(data.episodes)
+    with closing(iterate_parallel(lambda k: simulate(k, requested), range(count))) as episodes:
         for k, e in enumerate(data.episodes):
             remaining = f", {(time.monotonic() - start) / k * (count - k):.0f} s left" if k else ""
             progress(f"{e.name}, {k + 1} of {count}{remaining}")
             evidence = next(episodes)
-            able = evidence.is_simulated.tolist()
-            results.append((evidence, [h for h, is_able in zip(asked, able, strict=True) if is_able]))
-    return results, [h for h in asked if all(h in simulated for _, simulated in results)]
+            is_simulated = evidence.is_simulated.tolist()
+            results.append((evidence, [h for h, is_able in zip(requested, is_simulated, strict=True) if is_able]))
+    return results, [h for h in requested if all(h in simulated for _, simulated in results)]
 
 
 def _identify(hypotheses: Sequence[Hypothesis]) -> list[tuple[str, float]]:

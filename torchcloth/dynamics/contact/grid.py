@@ -37,7 +37,8 @@ class Grid(NamedTuple):
         points: [S, 3], barycentric coordinates of the contact points of each triangle.
         spacing: grid spacing [m].
         nodes: number of nodes per axis before the grid wraps.
-        skin: SEARCH_SKIN_SPACINGS in metres.
+        search_skin: SEARCH_SKIN_SPACINGS in metres, the margin of the search (Verlet 1967). A search stays valid until
+            a vertex has moved by half of it.
         reach: distance [m] of the centroids of triangles that may touch before candidates are searched again.
         free_compression: compression 1 - R33 of the director before layers press, dimensionless.
         damping: of the collision [s].
@@ -48,7 +49,7 @@ class Grid(NamedTuple):
     points: Tensor
     spacing: float
     nodes: int
-    skin: float
+    search_skin: float
     reach: float
     free_compression: float
     damping: float
@@ -158,7 +159,7 @@ class Contact:
             points=torch.as_tensor(points, dtype=torch.get_default_dtype()),
             spacing=spacing,
             nodes=int(np.ceil(WRAP_EXTENT_FACTOR * longest / spacing)) + 6,
-            skin=SEARCH_SKIN_SPACINGS * spacing,
+            search_skin=SEARCH_SKIN_SPACINGS * spacing,
             reach=reach,
             free_compression=self.free_compression,
             damping=self.damping,

@@ -38,14 +38,14 @@ class ContactCandidates(NamedTuple):
         active: [A] int64, scene E + triangle.
         scene: [A] int64.
         vertices: [3, A] int64, scene V + vertex.
-        slots: int32, scratch of the grid, one per node.
+        node_scratch: int32, work memory of ``place_on_grid``, one entry per node of the grid.
         x: [..., V, 3] m, positions at the search.
     """
 
     active: Tensor
     scene: Tensor
     vertices: Tensor
-    slots: Tensor
+    node_scratch: Tensor
     x: Tensor
 
 
@@ -55,7 +55,7 @@ class DirectorForces(NamedTuple):
     Attributes:
         column1: [A, 3] N/m, reaction in the warp column of the surface; without it angular momentum is not conserved.
         column2: [A, 3] N/m, reaction in the weft column.
-        pull: [A S, 3] N m, area-weighted derivative with respect to d3, which acts through the grid.
+        energy_by_d3: [A S, 3] N m, derivative of a director's energy with respect to d3, which acts through the grid.
         d3: [A S, 3] -, directors.
         mass: [A S, 1] kg, masses of the points.
         nodes: the points' nodes.
@@ -63,7 +63,7 @@ class DirectorForces(NamedTuple):
 
     column1: Tensor
     column2: Tensor
-    pull: Tensor
+    energy_by_d3: Tensor
     d3: Tensor
     mass: Tensor
     nodes: Stencil
@@ -73,7 +73,7 @@ class DirectorForces(NamedTuple):
 def find_contact_candidates(
     model: Model, grid: Grid, x: Tensor, previous: ContactCandidates | None = None
 ) -> ContactCandidates:
-    """Find the triangles whose points may meet another layer before a vertex moves by half the grid's skin.
+    """Find the triangles whose points may meet another layer before a vertex moves by half of ``grid.search_skin``.
 
     Another layer is what is near in space but far along the cloth.
 
@@ -83,7 +83,7 @@ def find_contact_candidates(
         x: [..., V, 3] m.
         previous: result of an earlier search, returned if no vertex has moved that far along any axis since.
     """
-    if previous is not None and float((x - previous.x).abs().max()) < grid.skin / 2:
+    if previous is not None and float((x - previous.x).abs().max()) < grid.search_skin / 2:
         return previous
     x = x.detach()
     centre = centroids(model.geometry, x.reshape(-1, *x.shape[-2:]))
@@ -95,8 +95,8 @@ def find_contact_candidates(
     scene, triangle = near.nonzero(as_tuple=True)
     scenes, triangles = near.shape
     vertices = model.geometry.corners.view(3, -1).index_select(1, triangle) + scene * x.shape[-2]
-    slots = torch.empty(scenes * grid.nodes**3 if len(scene) else 0, dtype=torch.int32, device=x.device)
-    return ContactCandidates(scene * triangles + triangle, scene, vertices, slots, x)
+    node_scratch = torch.empty(scenes * grid.nodes**3 if len(scene) else 0, dtype=torch.int32, device=x.device)
+    return ContactCandidates(scene * triangles + triangle, scene, vertices, node_scratch, x)
 
 
 def initial_directors(model: Model, grid: Grid, x: Tensor) -> Tensor:
@@ -137,16 +137,16 @@ def compute_director_forces(
     The collision's damping uses the rate of closing from the substep before. Divided as if it were implicit, it is
     stable however hard layers are pressed.
     """
-    count = grid.points.shape[0]
+    points_per_triangle = grid.points.shape[0]
     n, J, f1, f2, area = (_select_active(candidates, field, s.n) for field in (s.n, s.J, s.f1, s.f2, s.area))
-    d3 = state.d3.reshape(-1, count, 3).index_select(0, candidates.active)
+    d3 = state.d3.reshape(-1, points_per_triangle, 3).index_select(0, candidates.active)
     normal = n.unsqueeze(-2)
     by_normal, by_director = model.material.director_stress(
         coefficients_per_point(model, candidates, s), normal, d3 + grid.free_compression * normal
     )
     by_normal = by_normal + grid.free_compression * by_director
 
-    closing = state.memory["contact"].reshape(-1, count, 1).index_select(0, candidates.active)
+    closing = state.memory["contact"].reshape(-1, points_per_triangle, 1).index_select(0, candidates.active)
     pressure = dot(by_director, normal).clamp(max=0)
     density = _select_active(candidates, model.areal_density, s.n).unsqueeze(-2)
     implicit = (
@@ -155,13 +155,19 @@ def compute_director_forces(
     damping = pressure * (grid.damping * closing / implicit).clamp(min=-1)
     by_normal, by_director = by_normal + damping * d3, by_director + damping * normal
 
-    turn = by_normal.sum(-2) / count
-    turn = (turn - dot(turn, n) * n) / J  # n has unit length: only its tangential change is real
-    pull = (area.unsqueeze(-2) / count) * by_director
-    mass = _repeat_for_points(_select_active(candidates, model.areal_density * s.area, s.n) / count, count)
+    reaction = by_normal.sum(-2) / points_per_triangle
+    reaction = (reaction - dot(reaction, n) * n) / J  # n has unit length: only its tangential change is real
+    energy_by_d3 = (area.unsqueeze(-2) / points_per_triangle) * by_director
+    mass = _repeat_for_points(
+        _select_active(candidates, model.areal_density * s.area, s.n) / points_per_triangle, points_per_triangle
+    )
     position = _at_points(grid, candidates, state.x)
-    nodes = place_on_grid(position, mass, _repeat_for_points(candidates.scene, count), grid, candidates.slots)
-    return DirectorForces(cross(f2, turn), cross(turn, f1), pull.flatten(0, 1), d3.flatten(0, 1), mass, nodes)
+    nodes = place_on_grid(
+        position, mass, _repeat_for_points(candidates.scene, points_per_triangle), grid, candidates.node_scratch
+    )
+    return DirectorForces(
+        cross(f2, reaction), cross(reaction, f1), energy_by_d3.flatten(0, 1), d3.flatten(0, 1), mass, nodes
+    )
 
 
 def add_director_stress(
@@ -189,11 +195,11 @@ def contact_velocity_change(
     This is the exact transpose of how vertices carry velocity to the nodes, with the affine part. So linear and angular
     momentum are conserved to rounding, and contact is as symmetric as elasticity.
     """
-    count = grid.points.shape[0]
-    change, moment = transfer_director_forces(directors.nodes, directors.pull, directors.d3, grid.spacing, dt)
-    momentum = (directors.mass * change).unflatten(0, (-1, count))
+    points_per_triangle = grid.points.shape[0]
+    change, moment = transfer_director_forces(directors.nodes, directors.energy_by_d3, directors.d3, grid.spacing, dt)
+    momentum = (directors.mass * change).unflatten(0, (-1, points_per_triangle))
     shares = torch.stack([(grid.points[:, corner, None] * momentum).sum(-2) for corner in range(3)])
-    moments = (directors.mass.unsqueeze(-1) * moment).unflatten(0, (-1, count)).sum(1)
+    moments = (directors.mass.unsqueeze(-1) * moment).unflatten(0, (-1, points_per_triangle)).sum(1)
     shares = shares + _affine_shares(model, candidates, s, moments)
     total = torch.zeros_like(like).reshape(-1, 3).index_add(0, candidates.vertices.flatten(), shares.flatten(0, 1))
     return total.view(like.shape) / model.mass
@@ -241,17 +247,17 @@ def advance_directors(
     Returns:
         The directors [..., P, 3], and how fast they close, -dR33/dt [..., P, 1] 1/s.
     """
-    count = grid.points.shape[0]
-    d3 = after.n.repeat_interleave(count, dim=-2)
+    points_per_triangle = grid.points.shape[0]
+    d3 = after.n.repeat_interleave(points_per_triangle, dim=-2)
     closing = torch.zeros_like(d3[..., :1])
     if directors is None:
         return d3, closing
     affine = _mesh_velocity_gradient(model, v, before).flatten(-2)
-    affine = _repeat_for_points(_select_active(candidates, affine, before.n).unflatten(-1, (3, 3)), count)
+    affine = _repeat_for_points(_select_active(candidates, affine, before.n).unflatten(-1, (3, 3)), points_per_triangle)
     velocity = _at_points(grid, candidates, v)
     gradient = velocity_gradient(directors.nodes, directors.mass, velocity, affine, grid.spacing)
     carried = directors.d3 + dt * (gradient @ directors.d3.unsqueeze(-1)).squeeze(-1)
-    old_d3, new_d3 = (field.unflatten(0, (-1, count)) for field in (directors.d3, carried))
+    old_d3, new_d3 = (field.unflatten(0, (-1, points_per_triangle)) for field in (directors.d3, carried))
     old_n, n = (_select_active(candidates, field, field).unsqueeze(-2) for field in (before.n, after.n))
     height = dot(new_d3, n)
     coefficients, free = coefficients_per_point(model, candidates, before), grid.free_compression
@@ -263,11 +269,13 @@ def advance_directors(
 
 def director_energy(model: Model, grid: Grid, s: Surface, d3: Tensor) -> Tensor:
     """Compute the energy of all directors, [...] J."""
-    count = grid.points.shape[0]
+    points_per_triangle = grid.points.shape[0]
     c = type(model.coefficients)(*(k.unsqueeze(-2) for k in model.coefficients))
     n = s.n.unsqueeze(-2)
-    density = model.material.director_energy(c, n, d3.unflatten(-2, (-1, count)) + grid.free_compression * n)
-    return (s.area.unsqueeze(-2) / count * density).sum((-3, -2, -1))
+    density = model.material.director_energy(
+        c, n, d3.unflatten(-2, (-1, points_per_triangle)) + grid.free_compression * n
+    )
+    return (s.area.unsqueeze(-2) / points_per_triangle * density).sum((-3, -2, -1))
 
 
 def coefficients_per_point(model: Model, candidates: ContactCandidates, s: Surface) -> Any:
@@ -301,8 +309,8 @@ def _replace_active(candidates: ContactCandidates, field: Tensor, rows: Tensor) 
     return field.reshape(-1, *rows.shape[1:]).index_copy(0, candidates.active, rows).view(field.shape)
 
 
-def _repeat_for_points(rows: Tensor, count: int) -> Tensor:
-    return rows.repeat_interleave(count, 0)
+def _repeat_for_points(rows: Tensor, points_per_triangle: int) -> Tensor:
+    return rows.repeat_interleave(points_per_triangle, 0)
 
 
 def _at_points(grid: Grid, candidates: ContactCandidates, field: Tensor) -> Tensor:

@@ -32,7 +32,7 @@ class Stencil(NamedTuple):
     inverse_mass: Tensor
 
 
-def place_on_grid(position: Tensor, mass: Tensor, scene: Tensor, grid: Grid, slots: Tensor) -> Stencil:
+def place_on_grid(position: Tensor, mass: Tensor, scene: Tensor, grid: Grid, node_scratch: Tensor) -> Stencil:
     """Find the nodes around points, their weights and their masses.
 
     Args:
@@ -40,13 +40,13 @@ def place_on_grid(position: Tensor, mass: Tensor, scene: Tensor, grid: Grid, slo
         mass: [P, 1] kg, mass of each point.
         scene: [P] int64; points of different scenes do not interact.
         grid: spacing and size of the grid.
-        slots: int32 scratch, one entry per node and scene; overwritten.
+        node_scratch: int32 work memory, one entry per node and scene; overwritten.
     """
     scaled = position / grid.spacing
     base = torch.floor(scaled.detach() - 0.5)
     offset = scaled - base  # in [0.5, 1.5)
     weight, weight_gradient = _splines(offset, grid.spacing)
-    node = _compact(_node_index(base.long(), scene, grid.nodes).reshape(-1), slots)
+    node = _compact(_node_index(base.long(), scene, grid.nodes).reshape(-1), node_scratch)
     total = sum_on_nodes(node, mass * weight)
     smallest = (
         torch.finfo(total.dtype).tiny ** 0.5
@@ -55,15 +55,15 @@ def place_on_grid(position: Tensor, mass: Tensor, scene: Tensor, grid: Grid, slo
 
 
 def transfer_director_forces(
-    nodes: Stencil, pull: Tensor, director: Tensor, spacing: float, dt: float
+    nodes: Stencil, energy_by_d3: Tensor, director: Tensor, spacing: float, dt: float
 ) -> tuple[Tensor, Tensor]:
-    """Transfer the directors' forces -pull (d3 . grad w) on the nodes back to the points.
+    """Transfer the directors' forces -energy_by_d3 (d3 . grad w) on the nodes back to the points.
 
     This is the transpose of how points carry momentum to the nodes.
 
     Args:
         nodes: nodes of the points.
-        pull: [P, 3] N m, V d(psi)/d(d3): what the director's energy does through the grid's velocity gradient.
+        energy_by_d3: [P, 3] N m, V d(psi)/d(d3): what the director's energy does through the grid's velocity gradient.
         director: [P, 3] -, d3.
         spacing: grid spacing [m].
         dt: substep [s].
@@ -71,7 +71,7 @@ def transfer_director_forces(
     Returns:
         Change of each point's velocity [P, 3] m/s, and its moment about the point, change (x) arm [P, 3, 3] m^2/s.
     """
-    force = -(nodes.weight_gradient @ director.unsqueeze(-1)) * pull.unsqueeze(-2)
+    force = -(nodes.weight_gradient @ director.unsqueeze(-1)) * energy_by_d3.unsqueeze(-2)
     change = dt * sum_on_nodes(nodes.node, force) * nodes.inverse_mass.unsqueeze(-1)
     weighted = nodes.weight.unsqueeze(-1) * change
     arm = (stencil_nodes(director) - nodes.offset.unsqueeze(-2)) * spacing
@@ -133,10 +133,10 @@ def _node_index(base: Tensor, scene: Tensor, nodes: int) -> Tensor:
     return (((plane.unsqueeze(-1) + y.unsqueeze(-2)) * nodes).unsqueeze(-1) + z[:, None, None, :]).flatten(-3)
 
 
-def _compact(node: Tensor, slots: Tensor) -> Tensor:
+def _compact(node: Tensor, node_scratch: Tensor) -> Tensor:
     """Return rows [N] of a grid that holds only the nodes with points; equal nodes share a row.
 
     Each slot holds the number of the last entry that was written there, whichever that was: no sorting, no clearing.
     """
-    slots[node] = torch.arange(len(node), dtype=slots.dtype, device=node.device)
-    return slots[node].long()
+    node_scratch[node] = torch.arange(len(node), dtype=node_scratch.dtype, device=node.device)
+    return node_scratch[node].long()

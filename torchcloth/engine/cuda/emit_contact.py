@@ -160,10 +160,10 @@ class ContactSearchEmitter:
 
     def text(self) -> str:
         """Return the functions that loops over points call."""
-        places = ", ".join("{" + ", ".join(f"R({w!r})" for w in row) + "}" for row in self._stage.places.tolist())
+        places = ", ".join("{" + ", ".join(f"R({w!r})" for w in row) + "}" for row in self._stage.barycentric.tolist())
         slots, points = self._stage.node_slots, self._stage.points
         shift = 64 - (slots.bit_length() - 1)
-        numbers = {"points": points, "triangles": self._stage.triangles, "each": len(self._stage.places)}
+        numbers = {"points": points, "triangles": self._stage.triangles, "each": len(self._stage.barycentric)}
         numbers |= {"room": slots, "shift": shift, "around": NODES_OF_POINT, "row": POINT_ROW_NUMBERS}
         return CONTACT_FUNCTIONS.format(places=places, **numbers)
 
@@ -198,7 +198,7 @@ class ContactSearchEmitter:
         yield f"    bool moved = h.step % {s.search_interval} == 0;"
         yield f"    if (!moved) for (int i = T; i < {self._layout.fields[s.x].size}; i += THREADS) {{"
         yield "        const R change = x[i] - h.reference[i];"
-        yield f"        moved = moved || !(change < R({s.skin / 2!r}) && -change < R({s.skin / 2!r}));"
+        yield f"        moved = moved || !(change < R({s.search_skin / 2!r}) && -change < R({s.search_skin / 2!r}));"
         yield "    }"
         yield "    if (any(moved, h.shared)) {"
         yield f"        copy(h.reference, x, {self._layout.fields[s.x].size});"

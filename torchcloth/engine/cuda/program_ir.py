@@ -153,8 +153,8 @@ class ContactSearch(NamedTuple):
         lowest_node: field of each point's lowest node.
         fields: fields of nodes and points.
         corners: [3, E] vertices.
-        places: [S, 3] barycentric coordinates of a triangle's points.
-        spacing, skin, reach: of the grid [m].
+        barycentric: [S, 3] barycentric coordinates of a triangle's points.
+        spacing, search_skin, reach: of the grid [m].
         search_interval: substeps after which the search is repeated in any case.
         non_adjacent: [E, E] bool, pairs far apart along the cloth; None: all triangles are always active.
     """
@@ -163,9 +163,9 @@ class ContactSearch(NamedTuple):
     lowest_node: int
     fields: tuple[int, ...]
     corners: np.ndarray
-    places: np.ndarray
+    barycentric: np.ndarray
     spacing: float
-    skin: float
+    search_skin: float
     reach: float
     search_interval: int
     non_adjacent: np.ndarray | None
@@ -178,7 +178,7 @@ class ContactSearch(NamedTuple):
     @property
     def points(self) -> int:
         """Count of points E S."""
-        return self.triangles * len(self.places)
+        return self.triangles * len(self.barycentric)
 
     @property
     def node_slots(self) -> int:
@@ -187,7 +187,7 @@ class ContactSearch(NamedTuple):
 
     def rows(self, table: int) -> np.ndarray:
         """Return the rows [E S] of each point, by a ``ContactTable`` of the first group."""
-        each, triangle = len(self.places), np.repeat(np.arange(self.triangles), len(self.places))
+        each, triangle = len(self.barycentric), np.repeat(np.arange(self.triangles), len(self.barycentric))
         if table < TRIANGLE_CORNERS:
             return self.corners[table][triangle]
         tables = (triangle, np.arange(self.points), np.tile(np.arange(each), self.triangles))
@@ -272,7 +272,7 @@ def _contact_search(
     count: int,
     corners: np.ndarray,
     triangles: int,
-    places: np.ndarray,
+    barycentric: np.ndarray,
     each: int,
     lengths: np.ndarray,
     limits: tuple[int, int, int],
@@ -281,7 +281,7 @@ def _contact_search(
     patches_may_meet: np.ndarray,
     non_adjacent: np.ndarray,
 ) -> ContactSearch:
-    spacing, skin, reach = map(float, lengths)
+    spacing, search_skin, reach = map(float, lengths)
     search_interval, patches, size = limits
     matrix = None
     if patches:  # a bit for each triangle of a patch
@@ -292,7 +292,7 @@ def _contact_search(
             members = order[patch_starts[patch] : patch_starts[patch + 1]]
             matrix[np.ix_(order, members)] = bits[:, patch, : len(members)]
     return ContactSearch(
-        fields[0], fields[1], fields[2:], corners, places, spacing, skin, reach, search_interval, matrix
+        fields[0], fields[1], fields[2:], corners, barycentric, spacing, search_skin, reach, search_interval, matrix
     )
 
 

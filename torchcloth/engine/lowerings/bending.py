@@ -31,21 +31,21 @@ def lower_creasing(builder: SubstepBuilder, name: str, effect: CreasingBending, 
     _add_plate_forces(builder, effect, c)
     bending, memory = builder.bending_loop(effect.stencil), builder.memory[f"effects.{name}"]
     curl, mobility = (builder.parameter(cast("Tensor", part)) for part in (c.curl, c.mobility))
-    fields = (curl, memory.now, mobility, builder.dt, builder.number(effect.yield_curvature))
-    after = bending.loop.call("crease", bending.curvature, *(bending.loop.load(field) for field in fields))
-    bending.loop.store(after[:3], memory.after)
-    _add_rest_moment(bending, builder, c, after[3:])
+    fields = (curl, memory.start, mobility, builder.dt, builder.number(effect.yield_curvature))
+    result = bending.loop.call("crease", bending.curvature, *(bending.loop.load(field) for field in fields))
+    bending.loop.store(result[:3], memory.end)
+    _add_rest_moment(bending, builder, c, result[3:])
 
 
 @lowers(BendingFriction)
 def lower_bending_friction(builder: SubstepBuilder, name: str, effect: BendingFriction, c: Tensor) -> None:
     """Add the moment that opposes changes of curvature."""
     bending, memory = builder.bending_loop(effect.stencil), builder.memory[f"effects.{name}"]
-    fields = (memory.now, builder.number(effect.threshold), builder.parameter(c))
+    fields = (memory.start, builder.number(effect.threshold), builder.parameter(c))
     inputs = (bending.loop.load(field) for field in fields)
-    after = bending.loop.call("bending_friction", bending.curvature, *inputs)
-    bending.loop.store(after[:6], memory.after)
-    bending.add_moment(after[6:])
+    result = bending.loop.call("bending_friction", bending.curvature, *inputs)
+    bending.loop.store(result[:6], memory.end)
+    bending.add_moment(result[6:])
 
 
 @lowers(SaturatingBending)
@@ -73,10 +73,10 @@ def _add_plate_forces(builder: SubstepBuilder, effect: Bending, c: Coefficients)
 
     stiffness, viscosity = builder.parameter(c.stiffness), builder.parameter(c.viscosity)
     if builder.model.stages and effect.damping_time is not None:
-        add("scale3", [stiffness, builder.x.now], builder.force)
+        add("scale3", [stiffness, builder.x.start], builder.force)
         builder.viscous_forces.append(lambda v, force: add("scale3", [viscosity, v], force))
     else:
-        add("plate_operand", [stiffness, viscosity, builder.x.now, builder.v.now], builder.force)
+        add("plate_operand", [stiffness, viscosity, builder.x.start, builder.v.start], builder.force)
 
 
 def _add_rest_moment(bending: BendingLoop, builder: SubstepBuilder, c: Coefficients, rest: list[int]) -> None:

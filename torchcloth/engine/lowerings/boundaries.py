@@ -29,10 +29,10 @@ def lower_boundaries(builder: SubstepBuilder, velocity: VelocityStage) -> None:
         if not isinstance(boundary, AbstractCollider) or lowering_of(boundary) is None:
             raise UnsupportedPart(f"boundary {name!r} ({type(boundary).__name__})")
         velocity.to_registers()
-        velocity.before = velocity.now
+        velocity.velocities_before = velocity.velocities
         _add_collider(builder, name, boundary, velocity)
         if name in builder.prescribed:
-            _add_impulse(builder, name, velocity.loop, None, velocity.before, velocity.now)
+            _add_impulse(builder, name, velocity.loop, None, velocity.velocities_before, velocity.velocities)
 
 
 def _add_grasp(builder: SubstepBuilder, name: str, grasp: Grasp, velocity: VelocityStage, field: Field) -> None:
@@ -44,7 +44,7 @@ def _add_grasp(builder: SubstepBuilder, name: str, grasp: Grasp, velocity: Veloc
     loop.store(loop.load(field, rows), free)
     loop = builder.loop(count)
     inputs = [loop.load(f) for f in (increment, builder.dt, closed)]
-    grasped = loop.call("grasp_velocity", *inputs, loop.load(builder.x.now, rows), loop.load(free))
+    grasped = loop.call("grasp_velocity", *inputs, loop.load(builder.x.start, rows), loop.load(free))
     for key, (effect, c) in builder.model.effects.items():
         if effect.grasp != name:
             continue
@@ -60,8 +60,10 @@ def _add_collider(builder: SubstepBuilder, name: str, solid: AbstractCollider, v
     if solid.points is not None:
         sample_points.add_point_contact(builder, solid.points, body, velocity)
     loop = velocity.loop
-    x, ratio = loop.load(builder.x.now), builder.added_mass_ratio(loop)
-    velocity.now = loop.call("add3", velocity.now, body.velocity_change(loop, x, velocity.now, ratio))
+    x, ratio = loop.load(builder.x.start), builder.added_mass_ratio(loop)
+    velocity.velocities = loop.call(
+        "add3", velocity.velocities, body.velocity_change(loop, x, velocity.velocities, ratio)
+    )
 
 
 def _add_grip_slip(
@@ -87,5 +89,5 @@ def _add_impulse(
     """Add the impulse and its moment about the body's origin."""
     increment, pose, _ = builder.prescribed[name]
     momentum = builder.momentum(loop, loop.call("subtract3", after, before), rows)
-    place = loop.load(builder.x.now, rows), loop.load(increment), loop.load(pose)
+    place = loop.load(builder.x.start, rows), loop.load(increment), loop.load(pose)
     loop.add(loop.call("impulse", momentum, *place), builder.impulses[name])

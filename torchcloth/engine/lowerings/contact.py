@@ -47,7 +47,7 @@ class ContactLowering:
         self.clearance = builder.number(grid.free_compression)
         slowing = 2 * grid.damping / (APPROACH_PER_COMPRESSION_SPACINGS * grid.spacing) ** 2
         self.damping = program.constant(torch.tensor([[grid.damping, slowing]], dtype=torch.float64))
-        self.places = program.constant(grid.points)
+        self.barycentric = program.constant(grid.points)
         self.area = program.constant(model.geometry.area)
         self.shape = program.constant(torch.cat([*model.geometry.warp, *model.geometry.weft], dim=-1))
 
@@ -55,13 +55,13 @@ class ContactLowering:
         """Add the forces of compressed directors on the triangles' corners, and those of the nodes."""
         builder = self.builder
         builder.program.contact_search(self._search())
-        now = builder.x.now, self.d3.now, self.closing.now
-        self._reset_directors(ContactCount.ACTIVATED, ContactTable.ACTIVATED, *now)
+        at_start = builder.x.start, self.d3.start, self.closing.start
+        self._reset_directors(ContactCount.ACTIVATED, ContactTable.ACTIVATED, *at_start)
 
         # stress of the directors, and what they push on the nodes
         p = _PointLoop(self, is_replayed=True, is_first=True)
         contact, shear, _ = self._law(p)
-        d3, closing = p.point_value(self.d3.now), p.point_value(self.closing.now)
+        d3, closing = p.point_value(self.d3.start), p.point_value(self.closing.start)
         f1, f2, n, J = p.surface[0:3], p.surface[3:6], p.surface[12:15], p.surface[15:]
         density = p.parameter(builder.model.areal_density)
         constants = [p.loop.load(field) for field in (builder.dt, self.clearance, self.damping)]
@@ -82,23 +82,23 @@ class ContactLowering:
         """Let the directors follow the nodes' velocities, at the end of the substep."""
         builder = self.builder
         p = _PointLoop(self, is_replayed=True)
-        v = p.corner_values(builder.v.after)
+        v = p.corner_values(builder.v.end)
         shares = p.loop.call("momentum_shares", p.surface, *v, p.mass, p.place, p.shape, p.lengths)
         p.loop.p2g(p.offset, shares, self.momentum, _table(ContactTable.NODES), TransferBasis.AFFINE)
         builder.program.grid_velocity(self.mass, self.momentum, self.velocity, self.min_mass_kg)
 
         p = _PointLoop(self)
-        d3 = p.point_value(self.d3.now)
+        d3 = p.point_value(self.d3.start)
         gradient = p.loop.g2p(p.offset, self.velocity, _table(ContactTable.NODES), TransferBasis.GRADIENT)
-        normal = p.loop.call("surface", *p.corner_values(builder.x.after), p.shape)[12:15]
+        normal = p.loop.call("surface", *p.corner_values(builder.x.end), p.shape)[12:15]
         constants = p.loop.load(builder.dt), p.loop.load(self.clearance)
         inputs = p.surface[12:15], normal, d3, gradient, p.lengths, *self._law(p), *constants
         out = p.loop.call("update_director", *inputs)
-        p.loop.store(out[:3], self.d3.after, _table(ContactTable.POINT))
-        p.loop.store(out[3:], self.closing.after, _table(ContactTable.POINT))
+        p.loop.store(out[:3], self.d3.end, _table(ContactTable.POINT))
+        p.loop.store(out[3:], self.closing.end, _table(ContactTable.POINT))
 
-        after = builder.x.after, self.d3.after, self.closing.after
-        self._reset_directors(ContactCount.INACTIVE, ContactTable.INACTIVE, *after)
+        at_end = builder.x.end, self.d3.end, self.closing.end
+        self._reset_directors(ContactCount.INACTIVE, ContactTable.INACTIVE, *at_end)
 
     def _law(self, p: _PointLoop) -> list[list[int]]:
         """Registers of k h, gamma h and c_F."""
@@ -119,10 +119,10 @@ class ContactLowering:
         grid, corners = self.grid, self.builder.model.geometry.corners.view(3, -1)
         patches = patches_of(grid, corners)
         return ContactSearch(
-            fields=[self.builder.x.now, self.lowest_node, *self.nodes, *self.points],
+            fields=[self.builder.x.start, self.lowest_node, *self.nodes, *self.points],
             corners=corners.cpu().numpy().astype("int32"),
-            places=grid.points.cpu().double().numpy(),
-            lengths=(grid.spacing, grid.skin, grid.reach),
+            barycentric=grid.points.cpu().double().numpy(),
+            lengths=(grid.spacing, grid.search_skin, grid.reach),
             search_interval=SUBSTEPS_PER_CHECKPOINT,
             order=patches.order,
             patch_starts=patches.starts,
@@ -148,7 +148,7 @@ class _PointLoop:
         self.surface, self.offset, self.mass = shared
 
     def _compute(self) -> list[list[int]]:
-        corners = self.corner_values(self._contact.builder.x.now)
+        corners = self.corner_values(self._contact.builder.x.start)
         density = self.parameter(self._contact.builder.model.areal_density)
         lowest = self.loop.load(self._contact.lowest_node)
         values = [
@@ -178,7 +178,7 @@ class _PointLoop:
     @property
     def place(self) -> list[int]:
         """Registers of the barycentric coordinates of the point."""
-        return self.loop.load(self._contact.places, _table(ContactTable.PLACE))
+        return self.loop.load(self._contact.barycentric, _table(ContactTable.PLACE))
 
     @property
     def lengths(self) -> list[int]:

@@ -36,7 +36,7 @@ def lower_weight(builder: SubstepBuilder, name: str, effect: AbstractEffect, c: 
 @lowers(MassDamping)
 def lower_mass_damping(builder: SubstepBuilder, name: str, effect: MassDamping, c: Any) -> None:
     """Add a drag in proportion to mass and velocity."""
-    builder.add_vertex_force("mass_damping", builder.parameter(c), builder.mass, builder.v.now)
+    builder.add_vertex_force("mass_damping", builder.parameter(c), builder.mass, builder.v.start)
 
 
 @lowers(Adhesion)
@@ -44,14 +44,14 @@ def lower_adhesion(builder: SubstepBuilder, name: str, effect: Adhesion, c: Any)
     """Add the attraction of a plane."""
     plane = torch.cat([effect.point, effect.normal, effect.point.new_tensor([effect.gap])])[None]
     constant = builder.program.constant
-    builder.add_vertex_force("adhesion", builder.x.now, builder.parameter(c), constant(effect.area), constant(plane))
+    builder.add_vertex_force("adhesion", builder.x.start, builder.parameter(c), constant(effect.area), constant(plane))
 
 
 @lowers(AirDrag)
 def lower_air_drag(builder: SubstepBuilder, name: str, effect: AirDrag, c: Any) -> None:
     """Add the drag of air on the triangles."""
     t = builder.triangles
-    coefficients = [t.parameter(value) for value in (c.pressure, c.friction, c.wind)]
+    coefficients = [t.parameter(value) for value in (c.half_density_cn, c.half_density_ct, c.wind)]
     t.add_corner_forces("air_drag", *t.x, *t.v, *coefficients)
 
 
@@ -79,9 +79,9 @@ def lower_shear_friction(builder: SubstepBuilder, name: str, effect: ShearFricti
     """Add the stress of friction between the yarns."""
     t, memory = builder.triangles, builder.memory[f"effects.{name}"]
     threshold = t.loop.load(builder.number(effect.threshold))
-    after = t.loop.call("shear_friction", t.surface, t.loop.load(memory.now), threshold, t.parameter(c))
-    t.loop.store(after[:2], memory.after)
-    t.add_stress(after[2:])
+    result = t.loop.call("shear_friction", t.surface, t.loop.load(memory.start), threshold, t.parameter(c))
+    t.loop.store(result[:2], memory.end)
+    t.add_stress(result[2:])
 
 
 @lowers(ResidualForce)

@@ -46,9 +46,9 @@ def _update_plastic_set(builder: SubstepBuilder, surface: list[int]) -> list[int
         raise UnsupportedPart(f"plasticity {type(plastic).__name__}")
     t, memory = builder.triangles, builder.memory["material"]
     limit = t.parameter(builder.model.coefficients.limit)
-    after = t.loop.call("norm_yield", surface, t.loop.load(memory.now), limit)
-    t.loop.store(after, memory.after)
-    return after
+    plastic_set = t.loop.call("norm_yield", surface, t.loop.load(memory.start), limit)
+    t.loop.store(plastic_set, memory.end)
+    return plastic_set
 
 
 @lowers(AEP)

@@ -42,10 +42,10 @@ def add_point_contact(
     """Stop the points that approach the body, in several passes."""
     if not sample.weight.numel():
         return
-    points, field = _point_fields(builder, sample), velocity.spill()
+    points, field = _point_fields(builder, sample), velocity.spill_to_field()
     for _ in range(CONTACT_PASSES):
         field = _add_pass(builder, points, body, field)
-    velocity.reload(field)
+    velocity.reload_from_field(field)
 
 
 def _add_pass(builder: SubstepBuilder, points: _PointFields, body: BodyLowering, before: Field) -> Field:
@@ -53,11 +53,11 @@ def _add_pass(builder: SubstepBuilder, points: _PointFields, body: BodyLowering,
     approach = builder.program.temporary(builder.vertices, 2)
     loop = builder.program.loop(builder.vertices, no_derivative=True)
     v = loop.load(before)
-    contact, body_velocity = body.distance_and_velocity(loop, loop.load(builder.x.now))
+    contact, body_velocity = body.distance_and_velocity(loop, loop.load(builder.x.start))
     if body_velocity is None:
         body_velocity = loop.load(builder.program.constant(torch.zeros(1, 3)))
     loop.store(loop.call("approach", contact[:1], loop.load(body.limits), v, body_velocity), approach)
-    near = builder.program.broad_phase(builder.x.now, approach, builder.dt, points.tables, body.lipschitz)
+    near = builder.program.broad_phase(builder.x.start, approach, builder.dt, points.tables, body.lipschitz)
 
     # how much of each vertex's mass the touching points claim
     claims = builder.program.temporary(builder.vertices, 1)
@@ -90,12 +90,12 @@ def _velocity_change(
     def at_corners(field: Field) -> list[list[int]]:
         return [loop.load(field, corner) for corner in points.corners]
 
-    x, now = (loop.call("point_value", *at_corners(field), weight) for field in (builder.x.now, v))
+    x, v_points = (loop.call("point_value", *at_corners(field), weight) for field in (builder.x.start, v))
     if points.added_mass_ratio is None:
-        return body.velocity_change(loop, x, now, [])
+        return body.velocity_change(loop, x, v_points, [])
     ratios = at_corners(points.added_mass_ratio)
     halves = [loop.call("point_value", *(b[k : k + 3] for b in ratios), weight) for k in (0, 3)]
-    return body.velocity_change(loop, x, now, [*halves[0], *halves[1]])
+    return body.velocity_change(loop, x, v_points, [*halves[0], *halves[1]])
 
 
 def _ratio_field(builder: SubstepBuilder) -> Field | None:

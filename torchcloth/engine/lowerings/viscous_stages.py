@@ -13,12 +13,12 @@ def lower_viscous_stages(builder: SubstepBuilder) -> tuple[Loop, list[int]]:
     """Return a loop over the vertices, and registers of their velocities after all viscous stages."""
     if not builder.viscous_forces:
         loop = builder.loop(builder.vertices)
-        return loop, loop.load(builder.v.now)
+        return loop, loop.load(builder.v.start)
     first, slope = StagePolynomial.for_stages(builder.model.stages)
     zero, grip_count = builder.program.constant([[0.0, 0.0, 0.0]]), _grip_count(builder)
     # (before, now): velocities as neighbours see them, and velocities without the grips
-    seen, free = (zero, builder.v.now), (zero, builder.v.now)
-    loop, force = _viscous_force(builder, builder.v.now)
+    seen, free = (zero, builder.v.start), (zero, builder.v.start)
+    loop, force = _viscous_force(builder, builder.v.start)
     factors = first, slope
     for _ in range(builder.model.stages - 1):
         new = tuple(builder.program.temporary(builder.vertices, 3) for _ in range(2))
@@ -32,7 +32,7 @@ def lower_viscous_stages(builder: SubstepBuilder) -> tuple[Loop, list[int]]:
         seen, free, factors = (seen[1], new[0]), (free[1], new[1]), (2 * first, 2 * slope)
         loop, force = _viscous_force(builder, seen[1])
     last = _add_stage(builder, loop, free, factors, builder.number(0.0), force)
-    total = loop.call("add3", loop.load(builder.v.now), last)
+    total = loop.call("add3", loop.load(builder.v.start), last)
     return loop, loop.call("scale3", loop.load(builder.number(1 / (1 + CHEBYSHEV_PEAK))), total)
 
 
