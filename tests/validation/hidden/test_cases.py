@@ -69,7 +69,7 @@ def test_every_effect_of_the_engine_is_mapped_and_every_name_is_the_librarys():
 
 
 def test_amplitudes_are_the_librarys_typical_ones():
-    """A cause that is hidden below what the library looks for could never be found."""
+    """A cause that is hidden below what the library looks for could never be identified."""
     typical = {h.effect: abs(h.typical) for h in list_known_hypotheses()}
     for name, mapping in SINGLE_EFFECTS.items():
         amplitude = abs(CATALOGUE[name].typical if mapping.typical is None else mapping.typical)
@@ -160,7 +160,7 @@ def recorded_placement(case, episode):
 
 @pytest.mark.parametrize("name", ["obs.extrinsic", "obs.rotation", "robot.base"])
 def test_a_false_pose_is_within_the_spread_of_true_ones(name):
-    """If all true poses were alike, a false one could be read off."""
+    """If all true poses were equal, a false one could be read off."""
     nulls = [c for c in map(draw_case, range(300)) if c.family == "null"]
     effects = case_sampling._draw_effect(name, 1.0, np.random.default_rng(7), SINGLE_EFFECTS)
     usual, wrong = (
@@ -230,14 +230,14 @@ def test_the_data_sheet_is_off_and_the_fabric_is_not(tiny):
 
 def test_faults_change_what_they_say(tiny):
     case = draw_case(0, tiny)
-    good = make_episode(case, case.episodes[0], 1)
-    bad = {name: fault(good, np.random.default_rng(1)) for name, fault in FAULTS.items() if name}
-    assert 0.13 < np.diff(bad["clock jump"].points.t).max() < 0.64
-    assert bad["swapped grippers"].grasps["left"].uv[0, 0] == good.grasps["right"].uv[0, 0]
-    heights = np.ptp(bad["wrong unit"].points.xyz[:, 0]) / np.ptp(good.points.xyz[:, 0])
+    recording = make_episode(case, case.episodes[0], 1)
+    faulty = {name: fault(recording, np.random.default_rng(1)) for name, fault in FAULTS.items() if name}
+    assert 0.13 < np.diff(faulty["clock jump"].points.t).max() < 0.64
+    assert faulty["swapped grippers"].grasps["left"].uv[0, 0] == recording.grasps["right"].uv[0, 0]
+    heights = np.ptp(faulty["wrong unit"].points.xyz[:, 0]) / np.ptp(recording.points.xyz[:, 0])
     assert heights == pytest.approx(4.0) or heights == pytest.approx(0.25)
-    assert bad["mirrored"].points.xyz[:, 1] == pytest.approx(-good.points.xyz[:, 1])
-    assert {draw_case(18 + 20 * k).fault for k in range(4)} == bad.keys()
+    assert faulty["mirrored"].points.xyz[:, 1] == pytest.approx(-recording.points.xyz[:, 1])
+    assert {draw_case(18 + 20 * k).fault for k in range(4)} == faulty.keys()
 
 
 def test_truths_name_what_is_right():

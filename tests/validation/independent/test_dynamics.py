@@ -46,7 +46,7 @@ def test_a_flat_sheet_falls_through_air_as_the_closed_form():
     assert -mean == pytest.approx(terminal * np.tanh(9.81 * 0.5 / terminal), rel=1e-3)
 
 
-def test_moving_in_its_own_plane_a_sheet_feels_no_normal_drag():
+def test_sheet_that_moves_in_its_plane_feels_no_normal_drag():
     spec = replace(SMALL_SHEET, drag_normal=1.2, gravity=0.0)
     v0 = np.tile([1.0, 0.5, 0.0], (49, 1))
     result = MujocoCloth(spec, dt=1e-4).run(flat_positions(spec), np.array([0.0, 0.1]), {}, v0=v0)
@@ -62,12 +62,12 @@ def moving_grips(spec, seconds=0.3):
         pose = np.tile(np.eye(4), (len(t), 1, 1))
         pose[:, :3, :3] = Rotation.from_euler("zy", np.stack([sign * 2 * t, t], 1)).as_matrix()
         pose[:, :3, 3] = np.stack([0.3 * t**2 * 9, u - sign * 0.01 * t / seconds, spec.height + 0 * t], 1)
-        held = np.flatnonzero(np.linalg.norm(uv - [u, spec.height], axis=1) < 0.04)
-        grips[name] = Grip(held, t, pose)
+        grasped = np.flatnonzero(np.linalg.norm(uv - [u, spec.height], axis=1) < 0.04)
+        grips[name] = Grip(grasped, t, pose)
     return t, grips
 
 
-def test_held_vertices_follow_their_gripper():
+def test_grasped_vertices_follow_their_gripper():
     t, grips = moving_grips(SMALL_SHEET)
     x0 = vertical_positions(SMALL_SHEET)
     result = MujocoCloth(SMALL_SHEET, dt=1e-4).run(x0, t, grips)
@@ -76,8 +76,8 @@ def test_held_vertices_follow_their_gripper():
         assert len(grip.vertices) == 3
         pose = grip.pose
         local = (x0[grip.vertices] - pose[0, :3, 3]) @ pose[0, :3, :3]
-        wanted = np.einsum("kab,nb->kna", pose[:, :3, :3], local) + pose[:, None, :3, 3]
-        np.testing.assert_allclose(result.x[:, grip.vertices], wanted, atol=1e-9)
+        expected = np.einsum("kab,nb->kna", pose[:, :3, :3], local) + pose[:, None, :3, 3]
+        np.testing.assert_allclose(result.x[:, grip.vertices], expected, atol=1e-9)
 
 
 def test_the_grippers_forces_balance_momentum_and_its_moment():
@@ -105,8 +105,8 @@ def test_a_hanging_strip_swings_at_the_chain_s_frequency():
     spec = SheetSpec(0.04, length, nodes=(3, 16))
     t = np.array([0.0, 1.0])
     x0 = vertical_positions(spec)
-    held = np.flatnonzero(x0[:, 2] > length - 1e-9)
-    grip = {"top": Grip(held, t, np.tile(np.eye(4), (2, 1, 1)))}
+    grasped = np.flatnonzero(x0[:, 2] > length - 1e-9)
+    grip = {"top": Grip(grasped, t, np.tile(np.eye(4), (2, 1, 1)))}
     rest = settle(spec, x0, grip, 0.5, damping_rate=30.0)
     depth = length - rest[:, 2]
     start = rest + np.outer(0.004 * depth / length, [1, 0, 0])

@@ -45,7 +45,7 @@ def test_a_strip_under_load_stretches_and_contracts_as_saint_venant_kirchhoff(st
     assert -force[2] == pytest.approx(pull, rel=1e-5)
 
 
-def test_a_strip_hangs_under_its_own_weight():
+def test_hanging_strip_stretches_by_its_weight():
     x, force = hang(replace(STRIP, poisson_ratio=0.0), 0.0, damping_rate=20.0, seconds=1.5)
     # the mesh's lumped mass rounds the last row: 2 %
     assert -x[0, :, 2].mean() == pytest.approx(0.20 * 9.81 * LENGTH**2 / (2 * STIFFNESS), rel=0.02)

@@ -87,10 +87,10 @@ def test_patches_end_where_they_are_hidden_to_end_and_not_at_the_next_vertex(alo
     assert plain.aligned_to_patches is plain
     moved = other.aligned_to_patches
     assert moved.aligned_to_patches == moved
-    here, (u, v) = np.linspace(0, 0.3, 19), moved.sheet.grid_lines
+    uniform_lines, (u, v) = np.linspace(0, 0.3, 19), moved.sheet.grid_lines
     at = {"left": (3, along + 5e-3), "right": (-4, along - 5e-3)}  # lines at 50 and 250 mm
     for k, shift in at.values():
-        assert u[k] == pytest.approx(here[k] + shift)
+        assert u[k] == pytest.approx(uniform_lines[k] + shift)
     assert v[-4] == pytest.approx(0.25 - 5e-3)
     np.testing.assert_allclose(np.diff(u)[4:-4], np.diff(u)[4:-4].mean())
     hung = make_motion("hang", SHEET)
@@ -185,15 +185,15 @@ def test_a_wrong_camera_moves_everything_rigidly():
 @pytest.mark.parametrize("target", [TARGET_M, (0.55, 0.04, 0.26)])
 def test_a_camera_that_leans_turns_the_cloth_about_its_middle(target):
     """Wherever it looks: turned about another place, it would seem to stand elsewhere as well."""
-    here, there = (
+    upright, leaning = (
         sample_moving_sheet(target=target, **how).xyz - ROTATION_CENTRE_M
         for how in ({}, {"lean": 0.02, "heading": 90.0})
     )
     lean = 0.02
     along = np.array([0.0, 1.0, 0.0])
-    np.testing.assert_allclose(there @ along, here @ along, atol=1e-12)
-    turned = here * np.cos(lean) + np.cross(along, here) * np.sin(lean)
-    np.testing.assert_allclose(there[:, [0, 2]], turned[:, [0, 2]], atol=1e-12)
+    np.testing.assert_allclose(leaning @ along, upright @ along, atol=1e-12)
+    turned = upright * np.cos(lean) + np.cross(along, upright) * np.sin(lean)
+    np.testing.assert_allclose(leaning[:, [0, 2]], turned[:, [0, 2]], atol=1e-12)
 
 
 def test_the_slow_bias_has_about_its_size_and_lasts():
@@ -211,9 +211,9 @@ def test_occlusion_hides_a_bar_that_moves_across_and_edges_go_unseen():
     first, last = clouds.frame(0)[:, 1], clouds.frame(30)[:, 1]
     assert first.min() > -0.10  # seen from +x, left is where y is negative
     assert last.max() < 0.10
-    inner = sample_moving_sheet(edge=0.02).xyz
-    assert np.ptp(inner[:, 1]) <= 0.26
-    assert np.ptp(inner[:, 2]) <= 0.26
+    cropped = sample_moving_sheet(edge=0.02).xyz
+    assert np.ptp(cropped[:, 1]) <= 0.26
+    assert np.ptp(cropped[:, 2]) <= 0.26
 
 
 def test_backlash_follows_half_its_play_behind():

@@ -43,7 +43,7 @@ def test_the_two_engines_agree_on_a_hanging_sheet_and_disagree_about_another_one
     assert soft.material_rms > 2 * right.material_rms
 
 
-def test_a_model_that_is_its_own_truth_has_no_distance(study):
+def test_truth_as_model_has_no_distance(study):
     folder = study._episode("hang", 9)
     values, recording = FabricValues.from_truth(folder), read_remeshed(folder, 9)
     model = build_base_model(recording, values)

@@ -1,4 +1,4 @@
-"""APIC, the usual material point scheme, beside the scheme of the library."""
+"""APIC, the usual material point scheme, compared with the scheme of the library."""
 
 import pytest
 import torch

@@ -36,11 +36,11 @@ def std_without_common_error(answer: dict[str, Any], ends: Sequence[float], valu
 
 def amplitude_errors(truth: dict[str, Any], answer: dict[str, Any]) -> Iterator[tuple[str, float, float]]:
     """Yield ("amplitudes", relative error, its standard error) of each effect that is named outright."""
-    asked = scores.list_expected_effects(truth)
-    for cause, wanted in zip(scores.match_causes(scores.list_named_causes(answer), asked), asked, strict=True):
-        if cause is not None and cause.name in wanted.names and wanted.comparable:
-            std = std_without_common_error(answer, cause.ci95, cause.amplitude) / abs(wanted.amplitude)
-            yield "amplitudes", cause.amplitude / wanted.amplitude - 1, std
+    expected = scores.list_expected_effects(truth)
+    for cause, effect in zip(scores.match_causes(scores.list_named_causes(answer), expected), expected, strict=True):
+        if cause is not None and cause.name in effect.names and effect.comparable:
+            std = std_without_common_error(answer, cause.ci95, cause.amplitude) / abs(effect.amplitude)
+            yield "amplitudes", cause.amplitude / effect.amplitude - 1, std
 
 
 def fabric_errors(truth: dict[str, Any], answer: dict[str, Any]) -> Iterator[tuple[str, float, float]]:
@@ -49,9 +49,13 @@ def fabric_errors(truth: dict[str, Any], answer: dict[str, Any]) -> Iterator[tup
         return
     for name, fabric_name in FITTED_FABRIC_VALUES.items():
         if (row := answer.get("parameters", {}).get(name)) is not None:
-            true = truth["fabric"][fabric_name] / (SHEET_THICKNESS_M if name == "youngs_modulus" else 1.0)
+            true_value = truth["fabric"][fabric_name] / (SHEET_THICKNESS_M if name == "youngs_modulus" else 1.0)
             log_ends = [math.log(end) for end in row["ci95"]]
-            yield f"{name} of nulls", math.log(row["value"] / true), std_without_common_error(answer, log_ends, 1.0)
+            yield (
+                f"{name} of nulls",
+                math.log(row["value"] / true_value),
+                std_without_common_error(answer, log_ends, 1.0),
+            )
 
 
 def main(arguments: list[str] | None = None) -> int:

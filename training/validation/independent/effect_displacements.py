@@ -26,24 +26,24 @@ POINT_SELECTING_EFFECTS = ("obs.occlusion", "obs.edge")  # other points are seen
 Run = tuple[Scene, Motion, Result]
 
 
-def measure_displacement(name: str, plain: Run | None = None) -> tuple[float, float, Run]:
+def measure_displacement(name: str, reference: Run | None = None) -> tuple[float, float, Run]:
     """Return the RMS displacements [m] of the cloth and of the points by an effect, and the run without it."""
     effect = CATALOGUE[name]
-    if plain is None:
+    if reference is None:
         scene = Scene()
         scene = replace(scene, sheet=replace(scene.sheet, nodes=(NODES_PER_SIDE, NODES_PER_SIDE)))
         if name in REQUIRED_EFFECTS:
             scene = add_effect(scene, *REQUIRED_EFFECTS[name])
         motion = make_motion(effect.motion, scene.sheet)
-        plain = scene, motion, simulate(scene, motion)
-    scene, motion, result = plain
+        reference = scene, motion, simulate(scene, motion)
+    scene, motion, result = reference
     changed_scene = add_effect(scene, name, effect.typical)
     # errors of the sensor and of the base leave the cloth alone
     moves_cloth = effect.part != "sensor" and effect.field != "base"
     changed = simulate(changed_scene, motion) if moves_cloth else result
     cloth = resample_evenly(changed_scene, changed.x) - resample_evenly(scene, result.x)
     points = exact_points(changed_scene, motion, changed) - exact_points(scene, motion, result)
-    return rms_length(cloth), rms_length(points), plain
+    return rms_length(cloth), rms_length(points), reference
 
 
 def exact_points(scene: Scene, motion: Motion, result: Result) -> np.ndarray:

@@ -30,21 +30,25 @@ def draw_swings(episodes: dict[str, Recording], path: Path) -> None:
     for axis, run in zip(axes[0], ("range30_rep3", "range60_rep5", "range90_rep8"), strict=True):
         e = episodes[run]
         markers = e.require("markers")
-        good, mesh = markers.extra["accepted"], markers.xyz.reshape(-1, 8, 8, 3)
+        accepted, mesh = markers.extra["accepted"], markers.xyz.reshape(-1, 8, 8, 3)
         t, edge, low = markers.t + e.clock_offset, mesh[:, 1:-1, -1, 1], mesh[:, 1:-1, 0, 1]
         tool = e.grippers["hanger"]
         axis.plot(tool.t, tool.position[:, 1], color=GUIDE_GREY, label="tool")
-        axis.plot(t[good], np.nanmedian(edge, 1)[good], ".", color=MEASURED_BLUE, label="upper edge")
-        axis.plot(t[good], np.nanmedian(low, 1)[good], ".", color=COMPUTED_BROWN, ms=4, label="lower edge")
-        axis.plot(t[~good], np.nanmedian(edge, 1)[~good], "x", color="k", ms=4, label="rejected frames, upper edge")
-        axis.set(title=f"{run}: lag {-e.clock_offset:.3f} s, {(~good).sum()} of {len(good)} rejected", xlabel="s")
+        axis.plot(t[accepted], np.nanmedian(edge, 1)[accepted], ".", color=MEASURED_BLUE, label="upper edge")
+        axis.plot(t[accepted], np.nanmedian(low, 1)[accepted], ".", color=COMPUTED_BROWN, ms=4, label="lower edge")
+        axis.plot(
+            t[~accepted], np.nanmedian(edge, 1)[~accepted], "x", color="k", ms=4, label="rejected frames, upper edge"
+        )
+        axis.set(
+            title=f"{run}: lag {-e.clock_offset:.3f} s, {(~accepted).sum()} of {len(accepted)} rejected", xlabel="s"
+        )
         axis.set_ylabel("y, along the stroke, m")
     axes[0, 0].legend(fontsize=8)
     e = episodes["range60_rep5"]
     markers = e.require("markers")
-    good, mesh, t = markers.extra["accepted"], markers.xyz.reshape(-1, 8, 8, 3), markers.t + e.clock_offset
+    accepted, mesh, t = markers.extra["accepted"], markers.xyz.reshape(-1, 8, 8, 3), markers.t + e.clock_offset
     for axis, begin in zip(axes[1], (0.0, 4.0, 9.9), strict=True):
-        for i in np.flatnonzero(good & (t > begin))[:8]:
+        for i in np.flatnonzero(accepted & (t > begin))[:8]:
             side = np.nanmedian(mesh[i], axis=0)
             axis.plot(side[:, 1], side[:, 2], ".-", ms=4, label=f"{t[i]:.1f} s")
         corners = np.asarray(e.cloth.initial_vertices).mean(0)
@@ -96,18 +100,20 @@ def draw_knits(fabrics: dict[str, tuple[ForceDisplacement, ForceDisplacement]], 
     figure, axes = _make_figure(2, len(fabrics), (24, 8))
     ratios = []
     for column, (name, pair) in zip(axes.T, fabrics.items(), strict=True):
-        light = [table.select_rows(table.force < MAX_FITTED_KNIT_FORCE_N) for table in pair]
+        fitted_ranges = [table.select_rows(table.force < MAX_FITTED_KNIT_FORCE_N) for table in pair]
         fit = fit_tension(
             knit_adapter.initial_cloth(),
-            [table.select_repeats(1, 2) for table in light],
+            [table.select_repeats(1, 2) for table in fitted_ranges],
             knit_adapter.KNIT_PARAMETERS,
         )
         cloth = knit_adapter.initial_cloth()
         for key, place in fit.keys.items():
             cloth.get_submodule(place).set(fit.parameters[key].value)  # type: ignore[operator]
         ratios.append(fit.parameters["poisson_ratio"].value)
-        for label, tint, table, whole in zip("XY", (MEASURED_BLUE, COMPUTED_BROWN), light, pair, strict=True):
-            predicted, third = table.select_repeats(3), whole.select_repeats(3)
+        for label, tint, table, full_range in zip(
+            "XY", (MEASURED_BLUE, COMPUTED_BROWN), fitted_ranges, pair, strict=True
+        ):
+            predicted, third = table.select_repeats(3), full_range.select_repeats(3)
             curve = Uniaxial().curve(cloth.material, predicted)
             column[0].plot(third.strain, third.force, ".", color=tint, ms=4)
             column[0].plot(predicted.strain, curve.force.detach(), color=tint, label=f"pulled along {label}")

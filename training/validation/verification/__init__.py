@@ -1,1 +1,1 @@
-"""Verification of the physics: what is measured beside its truth, line by line. ``make verify`` runs it."""
+"""Verification of the physics: measurements and their exact values, line by line. ``make verify`` runs it."""

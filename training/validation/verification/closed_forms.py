@@ -41,7 +41,7 @@ def elastic_stretches(stretches: tuple[float, float], limit: float) -> tuple[flo
 
 
 def hanging_strip_elongation(areal_density: float, length: float, stiffness: float) -> float:
-    """Return the elongation [m] of a strip without lateral contraction under its own weight."""
+    """Return the elongation [m] of a hanging strip without lateral contraction under its weight."""
     return areal_density * STANDARD_GRAVITY_M_PER_S2 * length**2 / (2 * stiffness)
 
 

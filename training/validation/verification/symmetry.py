@@ -125,9 +125,9 @@ def turning_cylinder(fast: bool) -> Outcome:
         cloth = tc.Cloth(mesh, tc.materials.AEP(1e5), 0.15, {"b": tc.effects.Bending(stiffness, damping)}, contact=None)
         model, state = cloth.build_model(), cloth.state(x, v)
         effect, c = model.effects["b"]
-        now = EffectInputs(x, v, surface(model.geometry, x, v), model.mass)
-        still = now._replace(v=torch.zeros_like(v))
-        moving, static = (effect.force(c, inputs) for inputs in (now, still))
+        inputs = EffectInputs(x, v, surface(model.geometry, x, v), model.mass)
+        inputs_at_rest = inputs._replace(v=torch.zeros_like(v))
+        moving, static = (effect.force(c, at) for at in (inputs, inputs_at_rest))
         assert moving is not None
         assert static is not None
         powers.append(-float(((moving - static) * state.v).sum().detach()))
