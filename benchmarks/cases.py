@@ -16,7 +16,9 @@ import torchcloth as tc
 from torchcloth.effects import AbstractEffect, AirDrag, Bending, Gravity
 from torchcloth.errors import InvalidInput
 from torchcloth.meshes import Mesh
-from torchcloth.training.validation.verification.apic import APICCloth
+from torchcloth.training.validation.verification.apic import (  # pyright: ignore[reportMissingImports]
+    APICCloth,
+)
 
 SUBSTEP_S = 1.6e-4  # stable in every case
 SUBSTEPS_PER_FRAME = 250  # 25 frames a second

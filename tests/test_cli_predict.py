@@ -76,14 +76,14 @@ def test_another_episode(swing, tmp_path, capsys):
         assert file["vertices"].shape == (6, 49, 3)
         assert file["std"].shape == (6, 49)
     assert (out / "prediction.png").exists()
-    assert "was fitted" not in printed
+    assert "used this episode" not in printed
 
 
 def test_the_fitted_episode_is_no_prediction(swing, tmp_path, capsys):
     with twins.doubles():
         place = recordings.write(twins.first(twins.twin(), 6), tmp_path / "same")
     assert main(["predict", str(swing[0]), str(place), "--out", str(tmp_path / "out")]) == 0
-    assert "this episode was fitted" in capsys.readouterr().out
+    assert "the fit used this episode" in capsys.readouterr().out
 
 
 def test_wrong_input_is_one_line(strips, swing, tmp_path, capsys):

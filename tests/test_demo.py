@@ -17,7 +17,7 @@ def done(tmp_path_factory):
     """(output folder, identification.json); some 20 seconds."""
     out = tmp_path_factory.mktemp("demo") / "out"
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(streams, "truth", lambda folder: pytest.fail("truth.npz was opened"))
+        patch.setattr(streams, "read_truth", lambda folder: pytest.fail("truth.npz was opened"))
         assert main(["demo", "--out", str(out)]) == 0
     return out, json.loads((out / "identification.json").read_text())
 

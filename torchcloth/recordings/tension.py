@@ -74,8 +74,8 @@ class ForceDisplacement:
         """Strain [N], displacement over length."""
         return self.displacement / self.length
 
-    def select_rows(self, chosen: np.ndarray) -> ForceDisplacement:
-        """Return the table with the chosen rows only, by mask or index."""
+    def select_rows(self, chosen: np.ndarray | slice) -> ForceDisplacement:
+        """Return the table with the chosen rows only, by mask, index or slice."""
         picked = {key: value[chosen] for key, value in _arrays(self).items()}
         return ForceDisplacement(**{**_scalars(self), **picked, "path": self.path, "extra": self.extra})
 

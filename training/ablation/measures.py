@@ -80,4 +80,5 @@ def rank_correlation(a: Sequence[float], b: Sequence[float]) -> float:
     """Return Spearman's rank correlation; NaN if one side is constant."""
     if min(len(set(a)), len(set(b))) < 2:  # scipy would warn
         return float("nan")
-    return float(spearmanr(a, b).statistic)
+    correlation, _ = spearmanr(a, b)
+    return float(correlation)

@@ -132,6 +132,7 @@ def _at(recording: Recording, cloth: tc.Cloth, times: np.ndarray) -> Tensor:
     from scipy.interpolate import CubicSpline
 
     result = recording.require("truth", by="the study")
+    assert cloth.mesh.uv is not None
     side = round(len(result.vertices[0]) ** 0.5)
     width, height = np.ptp(np.asarray(cloth.mesh.uv), axis=0)
     spec = SheetSpec(width, height, nodes=(side, side))

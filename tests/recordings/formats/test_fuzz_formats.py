@@ -147,7 +147,7 @@ def attempt(truth: foreign_formats.Foreign, scene: Path, out: Path) -> Content |
 @pytest.fixture(autouse=True)
 def _quick(monkeypatch):
     """Tiny files are not brought to the disk 20 000 times."""
-    monkeypatch.setattr(atomic_write, "sync", lambda path: None)
+    monkeypatch.setattr(atomic_write, "sync_to_disk", lambda path: None)
 
 
 def fuzz(case: str, tmp_path: Path, count: int) -> Counter:

@@ -52,6 +52,8 @@ def recording(source: Path, name: str, every: int = 1) -> recordings.Recording:
     """Return a run on the study's mesh, with each ``every``-th frame."""
     mesh = _mesh()
     episode = swings.read_episode(source, name)
+    assert mesh.uv is not None
+    assert episode.points is not None
     cloth = replace(
         episode.cloth,
         sheet=None,
