@@ -39,7 +39,8 @@ struct PointBroadPhase : Stage<R> {
         thread_local std::vector<int> points;
         points.clear();
         for (int t = 0; t < triangles; t++) {
-            const size_t a = corner[t] * pitch, b = corner[t + triangles] * pitch, c = corner[t + 2 * triangles] * pitch;
+            const size_t a = corner[t] * pitch, b = corner[t + triangles] * pitch,
+                         c = corner[t + 2 * triangles] * pitch;
             const R travel = step * std::max(speed[a], std::max(speed[b], speed[c]));
             auto is_far = [&](size_t corner, R squared_length) {  // by more than rounding
                 return distance[corner] > R(1.0001) * (lipschitz * std::sqrt(squared_length) + travel) + R(1e-6);

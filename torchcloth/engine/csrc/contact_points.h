@@ -15,7 +15,8 @@ struct ContactPoints {
     std::vector<Wide<R>> weight;  // [packs, 3] barycentric coordinates
     int size() const { return int(point.size()); }
     // Lists the points of the first so many triangles whose bit of the mask is as wanted.
-    void select(const Mask& mask, bool wanted, const std::vector<int>* corners, int triangles, int points_per_triangle) {
+    void select(const Mask& mask, bool wanted, const std::vector<int>* corners, int triangles,
+                int points_per_triangle) {
         for (auto* v : {&corner[0], &corner[1], &corner[2], &triangle, &point, &place}) v->clear();
         for (int t = 0; t < triangles; t++)
             for (int s = 0; s < points_per_triangle && is_set(mask, t) == wanted; s++) {

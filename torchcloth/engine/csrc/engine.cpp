@@ -100,11 +100,13 @@ struct Engine {
         auto& p = engine.program;                                                                                      \
         return guarded([&] {                                                                                           \
             p.stages.push_back(                                                                                        \
-                std::make_unique<tc::Loop<R>>(p, engine.kernels.data(), items, list, contact_points, no_derivative != 0)); \
+                std::make_unique<tc::Loop<R>>(p, engine.kernels.data(), items, list, contact_points,                   \
+                                              no_derivative != 0));                                                    \
             p.stages.back()->is_replayed = replayed != 0;                                                              \
         });                                                                                                            \
     }                                                                                                                  \
-    TC_API int tc_transfer_##s(void* e, int code, int field, int table, int offset, int shares, int basis, int is_needed) { \
+    TC_API int tc_transfer_##s(void* e, int code, int field, int table, int offset, int shares, int basis,             \
+                               int is_needed) {                                                                        \
         auto& engine = *static_cast<Engine<R>*>(e);                                                                    \
         return guarded([&] {                                                                                           \
             engine.loop().code.push_back({tc::Opcode(code), field, table, -1, tc::NODE_NUMBERS, -1,                    \
@@ -114,22 +116,27 @@ struct Engine {
     }                                                                                                                  \
     TC_API int tc_contact_search_##s(void* e, const int* fields, int count, const int* corners, int triangles,         \
                               const double* places, int each, const double* lengths, const int* limits,                \
-                              const int* order, const int* starts, const uint8_t* may_meet, const uint8_t* non_adjacent) { \
+                              const int* order, const int* starts, const uint8_t* may_meet,                            \
+                              const uint8_t* non_adjacent) {                                                           \
         auto& program = static_cast<Engine<R>*>(e)->program;                                                           \
         return guarded([&] {                                                                                           \
             auto contact = std::make_unique<tc::ContactSearch<R>>(program);                                            \
-            contact->x = fields[0], contact->lowest_node = fields[1], contact->grid.assign(fields + 2, fields + count); \
+            contact->x = fields[0], contact->lowest_node = fields[1],                                                  \
+            contact->grid.assign(fields + 2, fields + count);                                                          \
             contact->spacing = R(lengths[0]), contact->skin = R(lengths[1]), contact->search_interval = limits[0];     \
             contact->place.assign(places, places + 3 * each);                                                          \
             if (limits[2] != tc::PATCH_TRIANGLES) throw std::logic_error("patches of another size");                   \
             contact->search.fill(corners, triangles, R(lengths[2]), limits[1], order, starts, may_meet, non_adjacent); \
-            program.mask_words = (triangles + 31) / 32, program.contact_tables = tc::contact_table::count, program.contact_counts = tc::contact_count::count; \
+            program.mask_words = (triangles + 31) / 32, program.contact_tables = tc::contact_table::count,             \
+            program.contact_counts = tc::contact_count::count;                                                         \
             program.stages.push_back(std::move(contact));                                                              \
         });                                                                                                            \
     }                                                                                                                  \
     TC_API int tc_grid_velocity_##s(void* e, int mass, int momentum, int velocity, double min_mass) {                  \
         auto& p = static_cast<Engine<R>*>(e)->program;                                                                 \
-        return guarded([&] { p.stages.push_back(std::make_unique<tc::GridVelocity<R>>(mass, momentum, velocity, R(min_mass))); }); \
+        return guarded([&] {                                                                                           \
+            p.stages.push_back(std::make_unique<tc::GridVelocity<R>>(mass, momentum, velocity, R(min_mass)));          \
+        });                                                                                                            \
     }                                                                                                                  \
     TC_API int tc_move_##s(void* e, int code, int field, int table, int reg) {                                         \
         auto& engine = *static_cast<Engine<R>*>(e);                                                                    \
@@ -162,13 +169,15 @@ struct Engine {
             engine.program.registers = std::max(engine.program.registers, out + tc::LOOKUP_REGISTERS);                 \
         });                                                                                                            \
     }                                                                                                                  \
-    TC_API int tc_broad_phase_##s(void* e, int list, int x, int approach, int dt, int corners, int starts, int triangles, \
+    TC_API int tc_broad_phase_##s(void* e, int list, int x, int approach, int dt, int corners, int starts,             \
+                                  int triangles,                                                                       \
                              double lipschitz) {                                                                       \
         auto& p = static_cast<Engine<R>*>(e)->program;                                                                 \
         return guarded([&] {                                                                                           \
             p.point_lists = std::max(p.point_lists, list + 1);                                                         \
             p.stages.push_back(                                                                                        \
-                std::make_unique<tc::PointBroadPhase<R>>(p, list, x, approach, dt, corners, starts, triangles, lipschitz)); \
+                std::make_unique<tc::PointBroadPhase<R>>(p, list, x, approach, dt, corners, starts, triangles,         \
+                                                         lipschitz));                                                  \
         });                                                                                                            \
     }                                                                                                                  \
     TC_API int tc_stencil_##s(void* e, int table, int weight, int x, int y, int form) {                                \

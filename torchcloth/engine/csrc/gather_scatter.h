@@ -171,7 +171,9 @@ struct GatherScatter {
                 for (int c = 0; c < comps; c += 4) {
                     P quad[4];
                     for (int k = 0; k < 4; k++) quad[k] = c + k < comps ? from[i.reg + c + k] : P(0.0);
-                    auto give = [&](int lane, Quad<R> numbers) { change(*reinterpret_cast<Quad<R>*>(to + place(lane) + c), numbers); };
+                    auto give = [&](int lane, Quad<R> numbers) {
+                        change(*reinterpret_cast<Quad<R>*>(to + place(lane) + c), numbers);
+                    };
                     if (lanes == L) scatter_quads(quad, give);
                     else scatter_quads(quad, [&](int lane, Quad<R> numbers) { if (lane < lanes) give(lane, numbers); });
                 }
@@ -202,14 +204,16 @@ struct GatherScatter {
             }
             const R* at = table + (size_t(cell[0]) * in[2] + cell[1]) * in[3] + cell[2];
             for (int corner = 0; corner < 8; corner++)
-                regs[out + 3 + corner].v[lane] = at[(size_t(corner >> 2) * in[2] + (corner >> 1 & 1)) * in[3] + (corner & 1)];
+                regs[out + 3 + corner].v[lane] =
+                    at[(size_t(corner >> 2) * in[2] + (corner >> 1 & 1)) * in[3] + (corner & 1)];
         }
     }
 
     // Adds the adjoints of a result to registers; after a store, the adjoint of the overwritten value is 0.
     TC_APART void scatter_adjoint(const Instruction& i, R* from, P* bars, int first, const ItemSpan& s) const {
         if (i.is_point_field) {
-            for (int c = 0; c < i.comps; c++) bars[i.reg + c] = bars[i.reg + c] + reinterpret_cast<P*>(from + packed_place(i, first))[c];
+            for (int c = 0; c < i.comps; c++)
+                bars[i.reg + c] = bars[i.reg + c] + reinterpret_cast<P*>(from + packed_place(i, first))[c];
             return;
         }
         const int lanes = count(first, s);
@@ -235,7 +239,8 @@ struct GatherScatter {
         if (from == nullptr) return;
         const D* source = reinterpret_cast<const D*>(from);
         D* to = dots + size_t(i.reg) * L;
-        if (i.is_point_field) return void(std::memcpy(static_cast<void*>(to), source + packed_place(i, first), i.comps * L * sizeof(D)));
+        if (i.is_point_field)
+            return void(std::memcpy(static_cast<void*>(to), source + packed_place(i, first), i.comps * L * sizeof(D)));
         rows(i, first, s, [&](auto place, auto) {
             components(i, [&](auto comps) {
                 for (int lane = 0; lane < L; lane++) {
@@ -246,16 +251,20 @@ struct GatherScatter {
         });
     }
     template <class D>
-    TC_APART void scatter_jvp(const Instruction& i, R* to, const D* dots, int first, bool adds, const ItemSpan& s) const {
+    TC_APART void scatter_jvp(const Instruction& i, R* to, const D* dots, int first, bool adds,
+                              const ItemSpan& s) const {
         D* target = reinterpret_cast<D*>(to);
         const D* from = dots + size_t(i.reg) * L;
-        if (i.is_point_field) return void(std::memcpy(static_cast<void*>(target + packed_place(i, first)), from, i.comps * L * sizeof(D)));
+        if (i.is_point_field)
+            return void(
+                std::memcpy(static_cast<void*>(target + packed_place(i, first)), from, i.comps * L * sizeof(D)));
         const int lanes = count(first, s);
         rows(i, first, s, [&](auto place, auto) {
             components(i, [&](auto comps) {
                 if (adds)
                     for (int lane = 0; lane < lanes; lane++)
-                        for (int c = 0; c < comps; c++) target[place(lane) + c] = target[place(lane) + c] + from[c * L + lane];
+                        for (int c = 0; c < comps; c++)
+                            target[place(lane) + c] = target[place(lane) + c] + from[c * L + lane];
                 else
                     for (int lane = 0; lane < lanes; lane++)
                         for (int c = 0; c < comps; c++) target[place(lane) + c] = from[c * L + lane];

@@ -1,4 +1,5 @@
-// Division of the nodes' momentum by their mass: dynamics/contact/transfer.py, push and velocity_gradient.
+// Division of the nodes' momentum by their mass: transfer_director_forces and velocity_gradient in
+// dynamics/contact/transfer.py.
 #pragma once
 
 #include "contact.h"
@@ -43,7 +44,8 @@ struct GridVelocity : Stage<R> {
     void tangent(Scene<R>& s) const override {
         forward(s);
         if (!sum_copies(s, s.dot[momentum], s.directions)) return;
-        const P *m = at(s.value[mass]), *quotient = at(s.value[velocity]), *m_dot = at(s.dot[mass]), *from = at(s.dot[momentum]);
+        const P *m = at(s.value[mass]), *quotient = at(s.value[velocity]), *m_dot = at(s.dot[mass]),
+                *from = at(s.dot[momentum]);
         P* to = at(s.dot[velocity]);
         over_blocks(s, [&](int first, int last) {
             for (int block = first; block < last; block++)
@@ -87,7 +89,8 @@ struct GridVelocity : Stage<R> {
     }
     using Half = Pack<R, BLOCK_NUMBERS / 2>;
     static Half& half(R* field, int block, int which, int k, int depth) {
-        return *reinterpret_cast<Half*>(field + (size_t(block) * depth + k) * BLOCK_NUMBERS + which * (BLOCK_NUMBERS / 2));
+        return *reinterpret_cast<Half*>(field + (size_t(block) * depth + k) * BLOCK_NUMBERS +
+                                        which * (BLOCK_NUMBERS / 2));
     }
     // Sums the upper halves of the copies of one block, and the lower halves of those of another; 0: no block.
     static void sum_block_copies(const SparseGrid<R>& nodes, R* field, int depth, int below, int above) {

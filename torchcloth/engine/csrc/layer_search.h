@@ -63,7 +63,8 @@ struct LayerSearch {
         const std::vector<PatchCentres> patch_centres = group_centres(centre);
         auto search = [&](int part, Mask& active, std::vector<R>& gap) {
             for (int i = part; i < patches; i += parts) {
-                const int end = int(std::upper_bound(low[0].begin() + i, low[0].end(), high[0][i] + reach) - low[0].begin());
+                const int end =
+                    int(std::upper_bound(low[0].begin() + i, low[0].end(), high[0][i] + reach) - low[0].begin());
                 std::fill(gap.begin() + i, gap.begin() + end, R(0));
                 for (int d = 0; d < 3; d++) {
                     const R lower = low[d][i], upper = high[d][i], *lows = low[d].data(), *highs = high[d].data();
@@ -80,7 +81,8 @@ struct LayerSearch {
                     }
             }
         };
-        std::vector<std::vector<R>> gaps(parts, first);  // allocated here, because an exception in a team ends the process
+        // allocated here, because an exception in a team ends the process
+        std::vector<std::vector<R>> gaps(parts, first);
         if (parts == 1) return search(0, mask, gaps[0]);
         std::vector<Mask> part_masks(parts, mask);
         team->run(parts, [&](int m) { search(m, part_masks[m], gaps[m]); });

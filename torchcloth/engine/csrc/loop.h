@@ -30,7 +30,9 @@ struct Loop : Stage<R>, ParallelReduce<R> {
     double cost(const Scene<R>& s) const override {
         // of contact points, only the active ones persist from substep to substep
         const int kind = Base::contact_points, active = contact_count::active;
-        const int items = Base::point_list >= 0 || kind > active ? 0 : kind == active ? s.contact_counts[kind] : Base::items;
+        const int items = Base::point_list >= 0 || kind > active ? 0
+                          : kind == active                       ? s.contact_counts[kind]
+                                                                 : Base::items;
         return items * ops_per_item * (s.bars.size ? 3 : s.dots.size ? 5 : 1);
     }
 
@@ -67,13 +69,15 @@ struct Loop : Stage<R>, ParallelReduce<R> {
         const FieldKind kind = program.fields[i.field].kind;
         return kind != FieldKind::temporary && kind != FieldKind::nodes && kind != FieldKind::points;
     }
-    TC_INLINE void compute(const Scene<R>& s, const ThreadView<R>& at, const Instruction& i, int first, const ItemSpan& all) const {
+    TC_INLINE void compute(const Scene<R>& s, const ThreadView<R>& at, const Instruction& i, int first,
+                           const ItemSpan& all) const {
         R* field = i.field >= 0 ? at.value[i.field] : nullptr;
         P* regs = at.regs;
         switch (i.code) {
             case Opcode::load:
                 if (i.invariant >= 0) field = s.invariants[i.invariant].packs.data;
-                if (i.invariant >= 0 || i.is_point_field) copy(regs + i.reg, reinterpret_cast<const P*>(field + packed_place(i, first)), i.comps);
+                if (i.invariant >= 0 || i.is_point_field)
+                    copy(regs + i.reg, reinterpret_cast<const P*>(field + packed_place(i, first)), i.comps);
                 else if (!is_shared(i)) gather(i, field, regs, first, all);
                 break;
             case Opcode::call: kernels[i.kernel].value(regs, i.in.data(), i.out.data()); break;
@@ -107,7 +111,8 @@ struct Loop : Stage<R>, ParallelReduce<R> {
                 prepare_rows(all, at.picked, first);
                 for (const Instruction& i : code) {
                     const bool has_results = i.code == Opcode::call || i.code == Opcode::g2p;
-                    if (has_results ? i.is_needed : i.code == Opcode::load || i.code == Opcode::lookup) compute(s, at, i, first, all);
+                    if (has_results ? i.is_needed : i.code == Opcode::load || i.code == Opcode::lookup)
+                        compute(s, at, i, first, all);
                     if (i.code == Opcode::load && !is_shared(i)) zero(bars, i.reg, i.comps);
                     else if (i.code == Opcode::lookup) zero(bars, i.out[0], LOOKUP_REGISTERS);
                     else if (i.code == Opcode::g2p) zero(bars, i.in[1], TRANSFER_SHARES);
@@ -120,7 +125,8 @@ struct Loop : Stage<R>, ParallelReduce<R> {
                     for (int c = 0; c < i.comps; c++) at.bar[i.field][c] += total(bars[i.reg + c]);
         });
     }
-    TC_INLINE void reverse_instruction(const ThreadView<R>& at, const Instruction& i, int first, const ItemSpan& all) const {
+    TC_INLINE void reverse_instruction(const ThreadView<R>& at, const Instruction& i, int first,
+                                       const ItemSpan& all) const {
         R* bar = i.field >= 0 ? at.bar[i.field] : nullptr;
         P *regs = at.regs, *bars = at.bars;
         switch (i.code) {
@@ -203,7 +209,8 @@ struct Loop : Stage<R>, ParallelReduce<R> {
                 break;
             case Opcode::lookup:
                 compute(s, at, i, first, all);
-                for (int k = 0; k < LOOKUP_REGISTERS * L; k++) dots[i.out[0] * L + k] = k < 3 * L ? dots[i.in[0] * L + k] : D(0.0);
+                for (int k = 0; k < LOOKUP_REGISTERS * L; k++)
+                    dots[i.out[0] * L + k] = k < 3 * L ? dots[i.in[0] * L + k] : D(0.0);
                 break;
         }
     }

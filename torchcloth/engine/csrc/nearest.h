@@ -36,7 +36,8 @@ struct Nearest {
             x[f / L].v[f % L] = middle.x, y[f / L].v[f % L] = middle.y, z[f / L].v[f % L] = middle.z;
             radius[f / L].v[f % L] = std::sqrt(farthest);
         }
-        for (int64_t f = count; f < int64_t(packs) * L; f++) radius[f / L].v[f % L] = std::numeric_limits<R>::infinity();
+        for (int64_t f = count; f < int64_t(packs) * L; f++)
+            radius[f / L].v[f % L] = std::numeric_limits<R>::infinity();
     }
 
     // The first of the nearest triangles; -1 if the point or the triangles are not finite.

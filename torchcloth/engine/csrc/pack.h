@@ -68,13 +68,17 @@ inline Pack<R, L> operator-(Pack<R, L> a) { return Pack<R, L>(-a.v); }
 
 // Comparisons return 1 or 0; `select` returns the first argument after the condition where that is not 0.
 template <class R, int L>
-inline Pack<R, L> less(Pack<R, L> a, Pack<R, L> b) { return Pack<R, L>(a.v < b.v ? Pack<R, L>(1.0).v : Pack<R, L>(0.0).v); }
+inline Pack<R, L> less(Pack<R, L> a, Pack<R, L> b) {
+    return Pack<R, L>(a.v < b.v ? Pack<R, L>(1.0).v : Pack<R, L>(0.0).v);
+}
 template <class R, int L>
 inline Pack<R, L> less(Pack<R, L> a, double b) { return less(a, Pack<R, L>(b)); }
 template <class R, int L>
 inline Pack<R, L> less(double a, Pack<R, L> b) { return less(Pack<R, L>(a), b); }
 template <class R, int L>
-inline Pack<R, L> select(Pack<R, L> c, Pack<R, L> a, Pack<R, L> b) { return Pack<R, L>(c.v != Pack<R, L>(0.0).v ? a.v : b.v); }
+inline Pack<R, L> select(Pack<R, L> c, Pack<R, L> a, Pack<R, L> b) {
+    return Pack<R, L>(c.v != Pack<R, L>(0.0).v ? a.v : b.v);
+}
 template <class R, int L>
 inline Pack<R, L> select(Pack<R, L> c, Pack<R, L> a, double b) { return select(c, a, Pack<R, L>(b)); }
 template <class R, int L>

@@ -21,7 +21,8 @@ struct ParallelReduce : GatherScatter<R> {
         for (int m = 1; m < parts; m++) lend_fields(s, s.scratch[m - 1], mode);
         const int packs = (all.items + L - 1) / L;
         s.team->run(parts, [&](int m) {
-            const int first = begin_of(m, parts, packs) * L, last = std::min(all.items, begin_of(m + 1, parts, packs) * L);
+            const int first = begin_of(m, parts, packs) * L,
+                      last = std::min(all.items, begin_of(m + 1, parts, packs) * L);
             if (m == 0) return f(s.view(), all, first, last);
             ThreadScratch<R>& scratch = s.scratch[m - 1];
             clear(s, scratch, all, mode, first, last);
@@ -104,7 +105,8 @@ struct ParallelReduce : GatherScatter<R> {
         if (i.table == SINGLE_ROW) return {0, 0};
         int low = row(i, first, all), high = low;
         if (all.list)
-            for (int k = first; k < last; k++) low = std::min(low, row(i, k, all)), high = std::max(high, row(i, k, all));
+            for (int k = first; k < last; k++)
+                low = std::min(low, row(i, k, all)), high = std::max(high, row(i, k, all));
         else {
             const int* at = index(i, all);
             for (int k = first; k < last; k++) low = std::min(low, at[k]), high = std::max(high, at[k]);

@@ -44,7 +44,11 @@ struct Buffer {  // aligned memory, zero at first
     Buffer(const Buffer&) = delete;
     Buffer& operator=(const Buffer&) = delete;
     Buffer(Buffer&& other) noexcept : data(other.data), size(other.size) { other.data = nullptr; other.size = 0; }
-    Buffer& operator=(Buffer&& other) noexcept { std::swap(data, other.data); std::swap(size, other.size); return *this; }
+    Buffer& operator=(Buffer&& other) noexcept {
+        std::swap(data, other.data);
+        std::swap(size, other.size);
+        return *this;
+    }
     ~Buffer() { std::free(data); }
     void reset(size_t n) {
         std::free(data);
@@ -97,7 +101,8 @@ struct ThreadScratch {
     Buffer<R> dots_memory;
     std::vector<int> picked;
     ThreadView<R> view() {
-        return {value.data(), bar.data(), dot.data(), regs_memory.data, bars_memory.data, dots_memory.data, picked.data()};
+        return {value.data(),     bar.data(),       dot.data(),   regs_memory.data,
+                bars_memory.data, dots_memory.data, picked.data()};
     }
 };
 

@@ -15,7 +15,8 @@ constexpr int pitch_of(int comps) { return comps == 1 ? 1 : round_up(comps, 4); 
 // Transposes four packs whose chunks of four lanes are rows into packs of one component each; it is its own inverse.
 inline void transpose(Pack<float, 16>* r) {
     typedef Pack<float, 16>::Lanes V;
-#define TC_LANES(a, b, c, d) a, b, c, d, a + 4, b + 4, c + 4, d + 4, a + 8, b + 8, c + 8, d + 8, a + 12, b + 12, c + 12, d + 12
+#define TC_LANES(a, b, c, d) \
+    a, b, c, d, a + 4, b + 4, c + 4, d + 4, a + 8, b + 8, c + 8, d + 8, a + 12, b + 12, c + 12, d + 12
     const V t0 = __builtin_shufflevector(r[0].v, r[1].v, TC_LANES(0, 16, 1, 17));
     const V t1 = __builtin_shufflevector(r[0].v, r[1].v, TC_LANES(2, 18, 3, 19));
     const V t2 = __builtin_shufflevector(r[2].v, r[3].v, TC_LANES(0, 16, 1, 17));

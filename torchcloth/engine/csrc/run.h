@@ -177,7 +177,9 @@ class Run {
 
     static bool is_input(FieldKind kind) { return kind == FieldKind::parameter || kind == FieldKind::per_substep; }
     static bool is_within(FieldKind kind) { return kind == FieldKind::temporary || kind == FieldKind::recorded; }
-    size_t size_of(const Field& f) const { return f.kind == FieldKind::per_substep ? size_t(call.substeps) * f.comps : f.size(); }
+    size_t size_of(const Field& f) const {
+        return f.kind == FieldKind::per_substep ? size_t(call.substeps) * f.comps : f.size();
+    }
 
     // Memory of one of so many tasks, with tangents along so many directions.
     Memory memory(int64_t scene, RunMode mode, int64_t tasks, int directions = 0) const {
@@ -185,7 +187,8 @@ class Run {
         const size_t count = program.fields.size();
         m.scene.value.assign(count, nullptr), m.scene.bar.assign(count, nullptr), m.scene.dot.assign(count, nullptr);
         m.values.resize(count), m.bars.resize(count), m.dots.resize(count);
-        m.scene.contact_counts.assign(program.contact_counts, 0), m.scene.contact_rows.assign(program.contact_tables, nullptr);
+        m.scene.contact_counts.assign(program.contact_counts, 0),
+            m.scene.contact_rows.assign(program.contact_tables, nullptr);
         m.scene.substeps = call.substeps, m.scene.has_masks = mode == RunMode::adjoints;
         if (interval) m.scene.masks = reinterpret_cast<int32_t*>(record(scene, record_count(call.substeps, interval)));
         m.scene.regs.reset(program.registers), m.scene.point_lists.resize(program.point_lists);
@@ -207,7 +210,8 @@ class Run {
                 m.values[f].reset(size_of(field));
                 m.scene.value[f] = m.values[f].data;
             }
-            if (is_input(field.kind)) load(m.values[f].data, field, call.ports[f].value, scene * call.ports[f].stride, 1);
+            if (is_input(field.kind))
+                load(m.values[f].data, field, call.ports[f].value, scene * call.ports[f].stride, 1);
             if (mode == RunMode::adjoints && (!is_input(field.kind) || call.ports[f].gradient)) {
                 m.bars[f].reset(size_of(field));
                 m.scene.bar[f] = m.bars[f].data;
@@ -272,7 +276,8 @@ class Run {
     void load_state(Memory& m, int64_t scene, R* row) const {
         for (size_t f = 0; f < program.fields.size(); f++) {
             const Field& field = program.fields[f];
-            if (field.kind == FieldKind::state) load(row + field.offset, field, call.ports[f].value, scene * call.ports[f].stride, 1);
+            if (field.kind == FieldKind::state)
+                load(row + field.offset, field, call.ports[f].value, scene * call.ports[f].stride, 1);
         }
     }
     // Writes the results of a frame, and clears the sums.
@@ -293,7 +298,8 @@ class Run {
         auto part = [&](int m) {
             f([&](R* field, size_t size) {
                 const size_t lines = (size + LANES<R> - 1) / LANES<R>;
-                std::fill(field + lines * m / s.parts * LANES<R>, field + std::min(size, lines * (m + 1) / s.parts * LANES<R>), R(0));
+                std::fill(field + lines * m / s.parts * LANES<R>,
+                          field + std::min(size, lines * (m + 1) / s.parts * LANES<R>), R(0));
             });
         };
         if (s.parts == 1) part(0);
@@ -306,7 +312,8 @@ class Run {
         if (m.scene.parts > 1) m.team->update_policy();
         for (size_t f = 0; f < program.fields.size(); f++) {
             const Field& field = program.fields[f];
-            if (field.kind == FieldKind::state || field.kind == FieldKind::recorded) m.scene.value[f] = row + field.offset;
+            if (field.kind == FieldKind::state || field.kind == FieldKind::recorded)
+                m.scene.value[f] = row + field.offset;
             if (program.next[f] >= 0) m.scene.value[program.next[f]] = after + field.offset;
             if (field.kind == FieldKind::per_substep) {
                 m.scene.value[f] = m.values[f].data + k * field.comps;
@@ -364,7 +371,8 @@ class Run {
             const Field& field = program.fields[f];
             const Port& port = call.ports[f];
             if ((is_input(field.kind) || field.kind == FieldKind::state) && port.tangent)
-                load(m.dots[f].data, field, port.tangent, scene * port.tangent_stride + direction * outer(field), group.size, which);
+                load(m.dots[f].data, field, port.tangent, scene * port.tangent_stride + direction * outer(field),
+                     group.size, which);
         });
     }
     void store_tangents(Memory& m, int64_t scene, const DirectionGroup& group) const {

@@ -117,7 +117,9 @@ struct SparseGrid {
         for (int c = 0; c < 3; c++) {
             P corner[4];
             const int* vertex = points.corner[c].data();
-            auto position = [&](int lane) { return x + size_t(vertex[first + lane < last ? first + lane : last]) * VERTEX_PITCH; };
+            auto position = [&](int lane) {
+                return x + size_t(vertex[first + lane < last ? first + lane : last]) * VERTEX_PITCH;
+            };
             gather_quads(position, corner);
             for (int d = 0; d < 3; d++) at[d] = at[d] + points.weight[first / L * 3 + c] * corner[d];
         }
@@ -165,17 +167,20 @@ struct SparseGrid {
             block_above.push_back(-1), is_lowest.push_back(false), next_copy.push_back(next), part_of.push_back(part);
             return added;
         } else {
-            const int below = block_number[slot_of(key_of(x, y, z - 1))], above = block_number[slot_of(key_of(x, y, z + 1))];
+            const int below = block_number[slot_of(key_of(x, y, z - 1))],
+                      above = block_number[slot_of(key_of(x, y, z + 1))];
             if (below) block_above[below] = added;
             if (above) is_lowest[above] = false;
-            block_above.push_back(above), is_lowest.push_back(below == 0), next_copy.push_back(0), part_of.push_back(part);
+            block_above.push_back(above), is_lowest.push_back(below == 0), next_copy.push_back(0),
+                part_of.push_back(part);
             key[at] = key_of(x, y, z), block_number[at] = added;
             return added;
         }
     }
     // Slot of a key in the hash table, or the free slot for it, where the block number is 0.
     size_t slot_of(int64_t wanted) const {
-        size_t at = (uint64_t(wanted) * 0x9E3779B97F4A7C15ull >> 43) & (key.size() - 1);  // high bits depend on the whole key
+        // high bits depend on the whole key
+        size_t at = (uint64_t(wanted) * 0x9E3779B97F4A7C15ull >> 43) & (key.size() - 1);
         while (key[at] != -1 && key[at] != wanted) at = (at + 1) & (key.size() - 1);
         return at;
     }

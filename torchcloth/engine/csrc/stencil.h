@@ -21,8 +21,15 @@ struct Stencil : Stage<R> {
     StencilForm form;
 
     Stencil(const Program<R>& p, int table, int weight, int x, int y, StencilForm form)
-        : program(p), weight(weight), x(x), y(y), vertices(p.fields[weight].vertices), neighbours(p.fields[weight].neighbours),
-          groups(p.fields[weight].groups()), count(p.fields[weight].rows / neighbours / vertices), form(form) {
+        : program(p),
+          weight(weight),
+          x(x),
+          y(y),
+          vertices(p.fields[weight].vertices),
+          neighbours(p.fields[weight].neighbours),
+          groups(p.fields[weight].groups()),
+          count(p.fields[weight].rows / neighbours / vertices),
+          form(form) {
         others.assign(size_t(groups) * neighbours * 4, 0);
         for (int n = 0; n < neighbours; n++)
             for (int v = 0; v < vertices; v++) others[at(0, v, n)] = p.tables[table][size_t(n) * vertices + v];
@@ -75,10 +82,14 @@ struct Stencil : Stage<R> {
     static V all(R number) { return V(typename V::Lanes{} + number); }
 
     template <int K>
-    const Row<K>& vector(const R* field, int v) const { return *reinterpret_cast<const Row<K>*>(field + size_t(v) * 4 * K); }
+    const Row<K>& vector(const R* field, int v) const {
+        return *reinterpret_cast<const Row<K>*>(field + size_t(v) * 4 * K);
+    }
     template <int K>
     Row<K>& vector(R* field, int v) const { return *reinterpret_cast<Row<K>*>(field + size_t(v) * 4 * K); }
-    const Quad<R>& quad(const R* field, int v) const { return *reinterpret_cast<const Quad<R>*>(field + size_t(v) * 4); }
+    const Quad<R>& quad(const R* field, int v) const {
+        return *reinterpret_cast<const Quad<R>*>(field + size_t(v) * 4);
+    }
     template <int K>
     Row<K> scaled_row(const R* field, int c, int v, R sign) const {
         Row<K> out{};
@@ -104,7 +115,8 @@ struct Stencil : Stage<R> {
                 for (int n = 0; n < used_neighbours[v / 4]; n++) {
                     const Part<K> weight = all<Part<K>>(w[at(c, v, n)]);
                     const Row<K>& neighbour = vector<K>(from, other(v, n));
-                    for (int k = 0; k < PACKS<K>; k++) sum.part[k] = sum.part[k] + weight * (neighbour.part[k] - centre.part[k]);
+                    for (int k = 0; k < PACKS<K>; k++)
+                        sum.part[k] = sum.part[k] + weight * (neighbour.part[k] - centre.part[k]);
                 }
                 add<K>(to, c, v, sum, sign);
             }
@@ -177,8 +189,10 @@ struct Stencil : Stage<R> {
         });
     }
     static Quad<R> sums(const Quad<R>* a) {  // the sum of each quad's numbers
-        const auto ab = __builtin_shufflevector(a[0].v, a[1].v, 0, 4, 2, 6) + __builtin_shufflevector(a[0].v, a[1].v, 1, 5, 3, 7);
-        const auto cd = __builtin_shufflevector(a[2].v, a[3].v, 0, 4, 2, 6) + __builtin_shufflevector(a[2].v, a[3].v, 1, 5, 3, 7);
+        const auto ab =
+            __builtin_shufflevector(a[0].v, a[1].v, 0, 4, 2, 6) + __builtin_shufflevector(a[0].v, a[1].v, 1, 5, 3, 7);
+        const auto cd =
+            __builtin_shufflevector(a[2].v, a[3].v, 0, 4, 2, 6) + __builtin_shufflevector(a[2].v, a[3].v, 1, 5, 3, 7);
         return Quad<R>(__builtin_shufflevector(ab, cd, 0, 1, 4, 5) + __builtin_shufflevector(ab, cd, 2, 3, 6, 7));
     }
     template <class D>

@@ -65,7 +65,8 @@ struct SurfaceDerivatives : Stage<R> {
     int weight, x, y;  // y has 15 components
     bool transposed;
 
-    SurfaceDerivatives(const Program<R>& p, std::shared_ptr<const StencilAndTranspose<R>> links, int weight, int x, int y, bool transposed)
+    SurfaceDerivatives(const Program<R>& p, std::shared_ptr<const StencilAndTranspose<R>> links, int weight, int x,
+                       int y, bool transposed)
         : program(p), links(std::move(links)), weight(weight), x(x), y(y), transposed(transposed) {}
 
     static bool fits(const Program<R>& p, int weight, int y) {
@@ -92,14 +93,17 @@ struct SurfaceDerivatives : Stage<R> {
 
   private:
     int vertices() const { return program.fields[x].rows; }
-    const Quad<R>& vector(const R* field, int v) const { return *reinterpret_cast<const Quad<R>*>(field + size_t(v) * 4); }
+    const Quad<R>& vector(const R* field, int v) const {
+        return *reinterpret_cast<const Quad<R>*>(field + size_t(v) * 4);
+    }
     Quad<R>& vector(R* field, int v) const { return *reinterpret_cast<Quad<R>*>(field + size_t(v) * 4); }
     const Row& row(const R* field, int v) const { return *reinterpret_cast<const Row*>(field + size_t(v) * 16); }
     Row& row(R* field, int v) const { return *reinterpret_cast<Row*>(field + size_t(v) * 16); }
     static Row five_times(Quad<R> a) {  // in two steps, because a widening shuffle would go through memory
         const auto b = __builtin_shufflevector(a.v, a.v, 0, 1, 2, 3, 4, 5, 6, 7);
         if constexpr (HALVED<R, 16>)
-            return {Wide<R>(__builtin_shufflevector(b, b, 0, 1, 2, 0, 1, 2, 0, 1)), Wide<R>(__builtin_shufflevector(b, b, 2, 0, 1, 2, 0, 1, 2, 3))};
+            return {Wide<R>(__builtin_shufflevector(b, b, 0, 1, 2, 0, 1, 2, 0, 1)),
+                    Wide<R>(__builtin_shufflevector(b, b, 2, 0, 1, 2, 0, 1, 2, 3))};
         else {
             const auto c = __builtin_shufflevector(b, b, 0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15);
             return Row(__builtin_shufflevector(c, c, 0, 1, 2, 0, 1, 2, 0, 1, 2, 0, 1, 2, 0, 1, 2, 3));
@@ -108,7 +112,8 @@ struct SurfaceDerivatives : Stage<R> {
     static Row weights(const R* w) {
         const auto a = reinterpret_cast<const Pack<R, 8>*>(w)->v;
         if constexpr (HALVED<R, 16>)
-            return {Wide<R>(__builtin_shufflevector(a, a, 0, 0, 0, 1, 1, 1, 2, 2)), Wide<R>(__builtin_shufflevector(a, a, 2, 3, 3, 3, 4, 4, 4, 5))};
+            return {Wide<R>(__builtin_shufflevector(a, a, 0, 0, 0, 1, 1, 1, 2, 2)),
+                    Wide<R>(__builtin_shufflevector(a, a, 2, 3, 3, 3, 4, 4, 4, 5))};
         else {
             const auto b = __builtin_shufflevector(a, a, 0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15);
             return Row(__builtin_shufflevector(b, b, 0, 0, 0, 1, 1, 1, 2, 2, 2, 3, 3, 3, 4, 4, 4, 5));
@@ -123,7 +128,8 @@ struct SurfaceDerivatives : Stage<R> {
                              __builtin_shufflevector(l, h, 12, 13, 14, 15);
             return Quad<R>(__builtin_shufflevector(sum, none, 0, 1, 2, 4));
         } else {
-            const auto b = a.v + __builtin_shufflevector(a.v, a.v, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15, 0, 1, 2);
+            const auto b =
+                a.v + __builtin_shufflevector(a.v, a.v, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15, 0, 1, 2);
             const auto c = b + __builtin_shufflevector(b, b, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15, 0, 1, 2, 3, 4, 5);
             const auto d = c + __builtin_shufflevector(a.v, a.v, 12, 13, 14, 15, 0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11);
             return Quad<R>(__builtin_shufflevector(__builtin_shufflevector(d, d, 0, 1, 2, 3), none, 0, 1, 2, 4));

@@ -41,9 +41,13 @@ struct TracedScalar {
     int id = -1;
 };
 
-#define TC_TWO(fn, o) constexpr TracedScalar fn(TracedScalar a, TracedScalar b) { return {a.tape, a.tape->push({TapeOp::o, a.id, b.id})}; }
+#define TC_TWO(fn, o)                                           \
+    constexpr TracedScalar fn(TracedScalar a, TracedScalar b) { \
+        return {a.tape, a.tape->push({TapeOp::o, a.id, b.id})}; \
+    }
 #define TC_ONE(fn, o) constexpr TracedScalar fn(TracedScalar a) { return {a.tape, a.tape->push({TapeOp::o, a.id})}; }
-#define TC_NUM(fn, o) constexpr TracedScalar fn(TracedScalar a, double c) { return {a.tape, a.tape->push({TapeOp::o, a.id, -1, -1, c})}; }
+#define TC_NUM(fn, o) \
+    constexpr TracedScalar fn(TracedScalar a, double c) { return {a.tape, a.tape->push({TapeOp::o, a.id, -1, -1, c})}; }
 TC_TWO(operator+, add)
 TC_TWO(operator-, sub)
 TC_TWO(operator*, mul)
@@ -66,10 +70,18 @@ constexpr TracedScalar operator+(double c, TracedScalar a) { return a + c; }
 constexpr TracedScalar operator*(double c, TracedScalar a) { return a * c; }
 constexpr TracedScalar operator-(TracedScalar a, double c) { return a + (-c); }
 constexpr TracedScalar operator/(TracedScalar a, double c) { return a * (1.0 / c); }
-constexpr TracedScalar operator-(double c, TracedScalar a) { return {a.tape, a.tape->push({TapeOp::rsubc, a.id, -1, -1, c})}; }
-constexpr TracedScalar operator/(double c, TracedScalar a) { return {a.tape, a.tape->push({TapeOp::rdivc, a.id, -1, -1, c})}; }
-constexpr TracedScalar less(double c, TracedScalar a) { return {a.tape, a.tape->push({TapeOp::cless, a.id, -1, -1, c})}; }
-constexpr TracedScalar select(TracedScalar c, TracedScalar a, TracedScalar b) { return {a.tape, a.tape->push({TapeOp::select, a.id, b.id, c.id})}; }
+constexpr TracedScalar operator-(double c, TracedScalar a) {
+    return {a.tape, a.tape->push({TapeOp::rsubc, a.id, -1, -1, c})};
+}
+constexpr TracedScalar operator/(double c, TracedScalar a) {
+    return {a.tape, a.tape->push({TapeOp::rdivc, a.id, -1, -1, c})};
+}
+constexpr TracedScalar less(double c, TracedScalar a) {
+    return {a.tape, a.tape->push({TapeOp::cless, a.id, -1, -1, c})};
+}
+constexpr TracedScalar select(TracedScalar c, TracedScalar a, TracedScalar b) {
+    return {a.tape, a.tape->push({TapeOp::select, a.id, b.id, c.id})};
+}
 constexpr TracedScalar select(TracedScalar c, TracedScalar a, double b) { return select(c, a, constant(a, b)); }
 constexpr TracedScalar select(TracedScalar c, double a, TracedScalar b) { return select(c, constant(b, a), b); }
 #undef TC_TWO
@@ -105,7 +117,8 @@ constexpr Trace trace() {
         if (n.op == TapeOp::input) { t.varies[i] = !is_constant_input<K>(i); continue; }
         if (n.op == TapeOp::constant) continue;
         t.flops++;
-        const bool flat = n.op == TapeOp::detach || n.op == TapeOp::less || n.op == TapeOp::lessc || n.op == TapeOp::cless;
+        const bool flat =
+            n.op == TapeOp::detach || n.op == TapeOp::less || n.op == TapeOp::lessc || n.op == TapeOp::cless;
         t.varies[i] = !flat && (t.varies[n.a] || (n.b >= 0 && t.varies[n.b]));
     }
     for (int i = t.tape.size - 1; i >= 0; i--) {  // only operations that pass an adjoint on are users
@@ -161,7 +174,8 @@ TC_INLINE P first_partial(const P* v) {
     else if constexpr (n.op == TapeOp::exp) return v[I];
     else if constexpr (n.op == TapeOp::expm1) return v[I] + 1.0;
     else if constexpr (n.op == TapeOp::atan2) return v[n.b] / (v[n.a] * v[n.a] + v[n.b] * v[n.b]);
-    else if constexpr (n.op == TapeOp::abs) return select(less(0.0, v[n.a]), P(1.0), select(less(v[n.a], 0.0), P(-1.0), P(0.0)));
+    else if constexpr (n.op == TapeOp::abs)
+        return select(less(0.0, v[n.a]), P(1.0), select(less(v[n.a], 0.0), P(-1.0), P(0.0)));
     else if constexpr (n.op == TapeOp::at_least) return 1.0 - less(v[n.a], n.value);
     else if constexpr (n.op == TapeOp::at_most) return 1.0 - less(n.value, v[n.a]);
     else return P(1.0);
@@ -200,7 +214,8 @@ TC_INLINE void reverse(const P* v, P* g) {
             accumulate_adjoint<K, I, n.b, true>(g, select(v[n.c], 0.0, g[I]));
         } else {
             if constexpr (t.varies[n.a]) {
-                if constexpr (n.op == TapeOp::rsubc || n.op == TapeOp::neg) accumulate_adjoint<K, I, n.a, false>(g, -g[I]);
+                if constexpr (n.op == TapeOp::rsubc || n.op == TapeOp::neg)
+                    accumulate_adjoint<K, I, n.a, false>(g, -g[I]);
                 else if constexpr (is_linear(n.op)) accumulate_adjoint<K, I, n.a, false>(g, g[I]);
                 else accumulate_adjoint<K, I, n.a, false>(g, g[I] * first_partial<K, I>(v));
             } else if constexpr (n.b == n.a) {
@@ -329,7 +344,9 @@ TC_INLINE void jvp(const P* v, const P* p, const P* q, Number number, P* t) {
 }
 
 template <class K, class P, int... I>
-TC_INLINE void all_partials(const P* v, P* p, P* q, std::integer_sequence<int, I...>) { (partials<K, I>(v, p, q), ...); }
+TC_INLINE void all_partials(const P* v, P* p, P* q, std::integer_sequence<int, I...>) {
+    (partials<K, I>(v, p, q), ...);
+}
 template <class K, class P, class Number, int... I>
 TC_INLINE void all_jvp(const P* v, const P* p, const P* q, Number number, P* t, std::integer_sequence<int, I...>) {
     (jvp<K, I>(v, p, q, number, t), ...);

@@ -28,7 +28,8 @@ class FlushDenormals {
 
 // Whether work is done in parallel or serially, as a team has measured it. Times are compared in trials.
 struct ParallelPolicy {
-    static constexpr int FIRST_INTERVAL = 250, MAX_INTERVAL = 8000;  // rounds to the next trial: more while trials agree
+    // rounds to the next trial: more while trials agree
+    static constexpr int FIRST_INTERVAL = 250, MAX_INTERVAL = 8000;
     bool is_serial = false, was_serial = false;                      // now, and after the last trial
     int round = 0, interval = FIRST_INTERVAL;  // round of a trial or since it; rounds to the next one
     // Rounds of a trial for each way, of which the last ones count. A new thread needs some rounds to get a processor.
@@ -98,7 +99,9 @@ class Worker {
         if (k % 256 == 0) __builtin_ia32_pause();  // seldom: a virtual machine's host suspends who pauses all the time
 #endif
     }
-    bool take(int64_t wanted) { return offer.piece.compare_exchange_strong(wanted, wanted + 1, std::memory_order_acq_rel); }
+    bool take(int64_t wanted) {
+        return offer.piece.compare_exchange_strong(wanted, wanted + 1, std::memory_order_acq_rel);
+    }
     void serve() {
         [[maybe_unused]] const FlushDenormals flush;
         for (;;) {
@@ -159,7 +162,10 @@ class ThreadTeam {
     ParallelPolicy policy;
 
     ThreadTeam(int64_t size, const ParallelPolicy& policy)
-        : size(int(size)), policy(policy), cores(int(size) - 1, CoreReservation::OnlyFree{}), round_start(Clock::now()) {}
+        : size(int(size)),
+          policy(policy),
+          cores(int(size) - 1, CoreReservation::OnlyFree{}),
+          round_start(Clock::now()) {}
     ThreadTeam(const ThreadTeam&) = delete;
     ThreadTeam& operator=(const ThreadTeam&) = delete;
     ~ThreadTeam() { WorkerPool::of_process().release(workers); }

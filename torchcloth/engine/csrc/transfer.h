@@ -53,7 +53,8 @@ TC_INLINE Block<R> repeat_each(const Quad<R>* source) {
     Wide<R> a;
     std::memcpy(&a, source, sizeof(a));
     if constexpr (HALVED<R, BLOCK_NUMBERS>)
-        return {Wide<R>(__builtin_shufflevector(a.v, a.v, 0, 0, 0, 0, 1, 1, 1, 1)), Wide<R>(__builtin_shufflevector(a.v, a.v, 2, 2, 2, 2, 3, 3, 3, 3))};
+        return {Wide<R>(__builtin_shufflevector(a.v, a.v, 0, 0, 0, 0, 1, 1, 1, 1)),
+                Wide<R>(__builtin_shufflevector(a.v, a.v, 2, 2, 2, 2, 3, 3, 3, 3))};
     else return Block<R>(__builtin_shufflevector(a.v, a.v, 0, 0, 0, 0, 1, 1, 1, 1, 2, 2, 2, 2, 3, 3, 3, 3));
 }
 // Quad k is the sum of the four quads of argument k.
@@ -61,7 +62,8 @@ template <class R>
 TC_INLINE Block<R> sum_quads(Block<R> a, Block<R> b, Block<R> c, Block<R> d) {
     if constexpr (HALVED<R, BLOCK_NUMBERS>) {
         auto halves = [](Wide<R> x, Wide<R> y) {
-            return Wide<R>(__builtin_shufflevector(x.v, y.v, 0, 1, 2, 3, 8, 9, 10, 11) + __builtin_shufflevector(x.v, y.v, 4, 5, 6, 7, 12, 13, 14, 15));
+            return Wide<R>(__builtin_shufflevector(x.v, y.v, 0, 1, 2, 3, 8, 9, 10, 11) +
+                           __builtin_shufflevector(x.v, y.v, 4, 5, 6, 7, 12, 13, 14, 15));
         };
         return {halves(a.low + a.high, b.low + b.high), halves(c.low + c.high, d.low + d.high)};
     } else {
@@ -118,7 +120,8 @@ TC_INLINE void to_lanes(const Wide<R>* regs, Block<R>* rows) {
 }
 template <class R>
 TC_INLINE void to_registers(const Block<R>* rows, Wide<R>* regs) {
-    for (int b = 0; b < 4; b++) gather_quads([&](int lane) { return reinterpret_cast<const R*>(rows + lane) + 4 * b; }, regs + 4 * b);
+    for (int b = 0; b < 4; b++)
+        gather_quads([&](int lane) { return reinterpret_cast<const R*>(rows + lane) + 4 * b; }, regs + 4 * b);
 }
 
 // Factors of the points of a pack along x and y, and along z at the four nodes of a block.
@@ -136,7 +139,8 @@ struct SplineFactors {
         const P *factor[4] = {three.f, three.g, three.f_slope, three.g_slope}, none(0.0);
         for (int q = 0; q < FACTORS; q++) {
             const P* n = factor[q];
-            P quad[4] = {select(second, none, n[0]), select(second, n[0], n[1]), select(second, n[1], n[2]), select(second, n[2], none)};
+            P quad[4] = {select(second, none, n[0]), select(second, n[0], n[1]), select(second, n[1], n[2]),
+                         select(second, n[2], none)};
             scatter_quads(quad, [&](int lane, Quad<R> numbers) { rows[q][lane] = numbers; });
         }
     }
@@ -218,8 +222,10 @@ struct Transfer {
         B shares[L], share_rows[L], offset_rows[L];
         to_lanes<R>(share, shares);
         for (int lane = 0; lane < lanes; lane++) {
-            const B f = factors.z(0, lane), g = factors.z(1, lane), f_slope = factors.z(2, lane), g_slope = factors.z(3, lane);
-            const B s = shares[lane], s0 = broadcast_quad<0>(s), s1 = broadcast_quad<1>(s), s2 = broadcast_quad<2>(s), s3 = broadcast_quad<3>(s);
+            const B f = factors.z(0, lane), g = factors.z(1, lane), f_slope = factors.z(2, lane),
+                    g_slope = factors.z(3, lane);
+            const B s = shares[lane], s0 = broadcast_quad<0>(s), s1 = broadcast_quad<1>(s), s2 = broadcast_quad<2>(s),
+                    s3 = broadcast_quad<3>(s);
             const B first = f * s0 + g * s3, second = f * s1, third = f * s2;
             B a(0.0), b(0.0), c(0.0), ax(0.0), bx(0.0), cx(0.0), ay(0.0), by(0.0), cy(0.0);
             const int* block = around + lane * BLOCKS_PER_POINT;
@@ -239,7 +245,8 @@ struct Transfer {
                 }
                 a = a + broadcast(x.f) * u, b = b + broadcast(x.g) * u, c = c + broadcast(x.f) * v;
                 bx = bx + broadcast(x.g_slope) * u, cx = cx + broadcast(x.f_slope) * v, cy = cy + broadcast(x.f) * vy;
-                if (!g_is_slope) ax = ax + broadcast(x.f_slope) * u, ay = ay + broadcast(x.f) * uy, by = by + broadcast(x.g) * uy;
+                if (!g_is_slope)
+                    ax = ax + broadcast(x.f_slope) * u, ay = ay + broadcast(x.f) * uy, by = by + broadcast(x.g) * uy;
             }
             if (g_is_slope) ax = b, ay = c, by = cx;
             offset_rows[lane] = sum_quads(first * ax + second * bx + third * cx, first * ay + second * by + third * cy,
@@ -249,7 +256,8 @@ struct Transfer {
         for (int lane = lanes; lane < L; lane++) offset_rows[lane] = share_rows[lane] = B(0.0);
         P sums[TRANSFER_SHARES];
         to_registers<R>(offset_rows, sums);
-        for (int d = 0; d < 3; d++) offset_bar[d] = offset_bar[d] + ((sums[4 * d] + sums[4 * d + 1]) + (sums[4 * d + 2] + sums[4 * d + 3]));
+        for (int d = 0; d < 3; d++)
+            offset_bar[d] = offset_bar[d] + ((sums[4 * d] + sums[4 * d + 1]) + (sums[4 * d + 2] + sums[4 * d + 3]));
         if (!SUMS_GRID) return;
         to_registers<R>(share_rows, sums);
         for (int k = 0; k < TRANSFER_SHARES; k++) share_bar[k] = share_bar[k] + sums[k];

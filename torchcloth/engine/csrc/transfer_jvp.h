@@ -20,7 +20,8 @@ struct TransferJvp {
         B shares[L];
         to_lanes<R>(share, shares);
         for (int lane = 0; lane < lanes; lane++) {
-            const B f = factors.z(0, lane), g = factors.z(1, lane), f_slope = factors.z(2, lane), g_slope = factors.z(3, lane);
+            const B f = factors.z(0, lane), g = factors.z(1, lane), f_slope = factors.z(2, lane),
+                    g_slope = factors.z(3, lane);
             const B s = shares[lane], s0 = broadcast_quad<0>(s), s1 = broadcast_quad<1>(s);
             const B s2 = broadcast_quad<2>(s), s3 = broadcast_quad<3>(s);
             const B a = f * s0 + g * s3, b = f * s1, c = f * s2;
@@ -35,12 +36,14 @@ struct TransferJvp {
                 for (int d = 0; d < 4; d++) {
                     const B z = broadcast(tangent_z[q + d]);
                     ad[d] = f * broadcast_quad<0>(moved[d]) + g * broadcast_quad<3>(moved[d]) + z * a_slope;
-                    bd[d] = f * broadcast_quad<1>(moved[d]) + z * b_slope, cd[d] = f * broadcast_quad<2>(moved[d]) + z * c_slope;
+                    bd[d] = f * broadcast_quad<1>(moved[d]) + z * b_slope,
+                    cd[d] = f * broadcast_quad<2>(moved[d]) + z * c_slope;
                 }
                 for (int i = 0; i < 3; i++) {
                     const LaneFactors<R> x = factors.x(i, lane);
                     const B u = broadcast(x.f) * a + broadcast(x.g) * b, v = broadcast(x.f) * c;
-                    const B u_slope = broadcast(x.f_slope) * a + broadcast(x.g_slope) * b, v_slope = broadcast(x.f_slope) * c;
+                    const B u_slope = broadcast(x.f_slope) * a + broadcast(x.g_slope) * b,
+                            v_slope = broadcast(x.f_slope) * c;
                     B ud[4], vd[4];
                     for (int d = 0; d < 4; d++) {
                         ud[d] = broadcast(x.f) * ad[d] + broadcast(x.g) * bd[d] + broadcast(tangent_x[q + d]) * u_slope;
@@ -50,7 +53,8 @@ struct TransferJvp {
                         const LaneFactors<R> y = factors.y(j, lane);
                         const B slope = broadcast(y.f_slope) * u + broadcast(y.g_slope) * v;
                         const size_t number = block[3 * i + j];
-                        B &at = reinterpret_cast<B*>(grid)[number], *block_tangent = reinterpret_cast<B*>(grid_dot) + number * N + q;
+                        B &at = reinterpret_cast<B*>(grid)[number],
+                          *block_tangent = reinterpret_cast<B*>(grid_dot) + number * N + q;
                         if (q == 0) at = at + broadcast(y.f) * u + broadcast(y.g) * v;
                         for (int d = 0; d < 4; d++)
                             block_tangent[d] = block_tangent[d] + broadcast(y.f) * ud[d] + broadcast(y.g) * vd[d] +
@@ -80,10 +84,12 @@ struct TransferJvp {
                 const LaneFactors<R> x = factors.x(i, lane);
                 a = a + broadcast(x.f) * u, b = b + broadcast(x.g) * u, c = c + broadcast(x.f) * v;
                 bx = bx + broadcast(x.g_slope) * u, cx = cx + broadcast(x.f_slope) * v, cy = cy + broadcast(x.f) * vy;
-                if (!g_is_slope) ax = ax + broadcast(x.f_slope) * u, ay = ay + broadcast(x.f) * uy, by = by + broadcast(x.g) * uy;
+                if (!g_is_slope)
+                    ax = ax + broadcast(x.f_slope) * u, ay = ay + broadcast(x.f) * uy, by = by + broadcast(x.g) * uy;
             }
             if (g_is_slope) ax = b, ay = c, by = cx;
-            const B f = factors.z(0, lane), g = factors.z(1, lane), f_slope = factors.z(2, lane), g_slope = factors.z(3, lane);
+            const B f = factors.z(0, lane), g = factors.z(1, lane), f_slope = factors.z(2, lane),
+                    g_slope = factors.z(3, lane);
             shares[lane] = sum_quads(f * a, f * b, f * c, g * a);
             const B by_x = sum_quads(f * ax, f * bx, f * cx, g * ax), by_y = sum_quads(f * ay, f * by, f * cy, g * ay);
             const B by_z = sum_quads(f_slope * a, f_slope * b, f_slope * c, g_slope * a);
@@ -98,17 +104,22 @@ struct TransferJvp {
                     for (int d = 0; d < 4; d++) ud[d] = vd[d] = B(0.0);
                     for (int j = 0; j < 3; j++) {
                         const LaneFactors<R> y = factors.y(j, lane);
-                        const B* block_tangent = reinterpret_cast<const B*>(grid_dot) + size_t(block[3 * i + j]) * N + q;
-                        for (int d = 0; d < 4; d++) ud[d] = ud[d] + broadcast(y.f) * block_tangent[d], vd[d] = vd[d] + broadcast(y.g) * block_tangent[d];
+                        const B* block_tangent =
+                            reinterpret_cast<const B*>(grid_dot) + size_t(block[3 * i + j]) * N + q;
+                        for (int d = 0; d < 4; d++)
+                            ud[d] = ud[d] + broadcast(y.f) * block_tangent[d],
+                            vd[d] = vd[d] + broadcast(y.g) * block_tangent[d];
                     }
                     const LaneFactors<R> x = factors.x(i, lane);
                     for (int d = 0; d < 4; d++)
-                        ad[d] = ad[d] + broadcast(x.f) * ud[d], bd[d] = bd[d] + broadcast(x.g) * ud[d], cd[d] = cd[d] + broadcast(x.f) * vd[d];
+                        ad[d] = ad[d] + broadcast(x.f) * ud[d], bd[d] = bd[d] + broadcast(x.g) * ud[d],
+                        cd[d] = cd[d] + broadcast(x.f) * vd[d];
                 }
                 B moved[4];
                 for (int d = 0; d < 4; d++)
                     moved[d] = sum_quads(f * ad[d], f * bd[d], f * cd[d], g * ad[d]) +
-                               (broadcast(tangent_x[q + d]) * by_x + broadcast(tangent_y[q + d]) * by_y + broadcast(tangent_z[q + d]) * by_z);
+                               (broadcast(tangent_x[q + d]) * by_x + broadcast(tangent_y[q + d]) * by_y +
+                                broadcast(tangent_z[q + d]) * by_z);
                 scatter_directions(moved, q, share_dot + lane);
             }
         }
@@ -137,7 +148,8 @@ struct TransferJvp {
         if constexpr (HALVED<R, BLOCK_NUMBERS>) {
             P low[4], high[4];
             for (int d = 0; d < 4; d++) low[d] = from[d].low, high[d] = from[d].high;
-            scatter_quads(low, give), scatter_quads(high, [give](int number, Quad<R> tangent) { give(number + L, tangent); });
+            scatter_quads(low, give),
+                scatter_quads(high, [give](int number, Quad<R> tangent) { give(number + L, tangent); });
         } else scatter_quads(from, give);
     }
 };

@@ -29,7 +29,9 @@ constexpr Vec<T> cross(Vec<T> a, Vec<T> b) {
     return {a.y * b.z - a.z * b.y, a.z * b.x - a.x * b.z, a.x * b.y - a.y * b.x};
 }
 template <class T>
-constexpr Vec<T> select(T c, Vec<T> a, Vec<T> b) { return {select(c, a.x, b.x), select(c, a.y, b.y), select(c, a.z, b.z)}; }
+constexpr Vec<T> select(T c, Vec<T> a, Vec<T> b) {
+    return {select(c, a.x, b.x), select(c, a.y, b.y), select(c, a.z, b.z)};
+}
 
 // Square root with value and derivative 0 at 0.
 template <class T>
@@ -65,7 +67,8 @@ constexpr Symmetric<T> outer(T s, Vec<T> a) {
 }
 template <class T>
 constexpr Vec<T> operator*(Symmetric<T> m, Vec<T> v) {
-    return {m.xx * v.x + m.xy * v.y + m.xz * v.z, m.xy * v.x + m.yy * v.y + m.yz * v.z, m.xz * v.x + m.yz * v.y + m.zz * v.z};
+    return {m.xx * v.x + m.xy * v.y + m.xz * v.z, m.xy * v.x + m.yy * v.y + m.yz * v.z,
+            m.xz * v.x + m.yz * v.y + m.zz * v.z};
 }
 template <class T>
 constexpr Vec<T> solve(Symmetric<T> m, Vec<T> y) {

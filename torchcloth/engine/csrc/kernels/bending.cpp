@@ -1,11 +1,13 @@
-// Curvature of a sheet, and forces of bending: torchcloth/effects/_bending_stencil.py, bending.py, saturating.py, crease.py.
+// Curvature of a sheet, and forces of bending: torchcloth/effects/_bending_stencil.py, bending.py, saturating.py,
+// crease.py.
 #include "kernels.h"
 #include "../vec.h"
 
 namespace tc {
 namespace {
 
-constexpr double MIN_AREA_RATIO = 0.5;  // of effects/_bending_stencil.py: a fit with less has no normal
+// MIN_FIT_AREA_RATIO of effects/_bending_stencil.py: a fit with less has no normal
+constexpr double MIN_AREA_RATIO = 0.5;
 
 // The vector that the plate matrix multiplies: stiffness x + viscosity v. effects/bending.py
 struct PlateOperand {
@@ -21,7 +23,8 @@ struct PlateOperand {
 };
 TC_KERNEL(PlateOperand)
 
-// Normal, area ratio and curvature, from the derivatives of x along ww, ff, sqrt 2 wf, w, f. effects/_bending_stencil.py
+// Normal, area ratio and curvature, from the derivatives of x along ww, ff, sqrt 2 wf, w, f.
+// effects/_bending_stencil.py
 struct SheetCurvature {
     static constexpr const char* name = "sheet_curvature";
     static constexpr int inputs = 15, outputs = 7;

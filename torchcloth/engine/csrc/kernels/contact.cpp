@@ -8,7 +8,9 @@ namespace {
 
 // Value at a point, from barycentric coordinates and the values at the corners.
 template <class T>
-constexpr Vec<T> at_point(Vec<T> place, Vec<T> a, Vec<T> b, Vec<T> c) { return place.x * a + place.y * b + place.z * c; }
+constexpr Vec<T> at_point(Vec<T> place, Vec<T> a, Vec<T> b, Vec<T> c) {
+    return place.x * a + place.y * b + place.z * c;
+}
 
 // Mass of a point, from areal density, area and the point's fraction of it.
 struct PointMass {
@@ -21,7 +23,8 @@ struct PointMass {
 TC_KERNEL(PointMass)
 
 // A point's stress columns and pull on its director, from n, J, f1, f2, d3, closing rate, areal density, contact and
-// shear stiffness, area, fraction, dt, clearance, damping and its limit by the substep. self_contact.pressure
+// shear stiffness, area, fraction, dt, clearance, damping and its limit by the substep.
+// self_contact.compute_director_forces
 struct ContactPressure {
     static constexpr const char* name = "contact_pressure";
     static constexpr int inputs = 23, outputs = 9;
@@ -91,7 +94,7 @@ struct ForceShares {
 TC_KERNEL(ForceShares)
 
 // Forces on the corners, from surface, mass, the sums of the nodes' accelerations, place, shape, spacing and its
-// inverse. self_contact.repulsion
+// inverse. self_contact.contact_velocity_change
 struct CornerForces {
     static constexpr const char* name = "corner_forces";
     static constexpr int inputs = 42, outputs = 9;
@@ -125,7 +128,7 @@ struct CornerForces {
 TC_KERNEL(CornerForces)
 
 // Shares of the momentum in the weights and in the arms, from surface, velocities of the corners, mass, place, shape,
-// spacing and its inverse. transfer.carried_momentum of self_contact._mesh_gradient
+// spacing and its inverse. transfer.affine_momentum of self_contact._mesh_velocity_gradient
 struct MomentumShares {
     static constexpr const char* name = "momentum_shares";
     static constexpr int inputs = 35, outputs = 16;
@@ -169,7 +172,7 @@ constexpr Vec<T> return_map(T contact, T shear, T cone, Vec<T> n, Vec<T> d) {
 }
 
 // Director and closing rate after the substep, from the normals before and after, d3, the sums of the nodes'
-// velocities, spacing and its inverse, contact, shear, cone, dt and clearance. self_contact.follow
+// velocities, spacing and its inverse, contact, shear, cone, dt and clearance. self_contact.advance_directors
 struct UpdateDirector {
     static constexpr const char* name = "update_director";
     static constexpr int inputs = 32, outputs = 4;

@@ -5,8 +5,10 @@
 namespace tc {
 namespace {
 
-// Forces of air drag on the corners, from positions and velocities of the corners, pressure and friction coefficients
-// and wind. effects/air.py
+// Forces of air drag on the corners, from positions and velocities of the corners, half the air's density times C_n
+// and C_t, and wind. effects/air.py: f = -1/2 rho a (C_n |u_n| u_n n + C_t |u_t| u_t), a third on each corner. With
+// N = `normal` = 2 a n: u_n = u.N / |N|, and u_n n = (u.N / N.N) N = `flow_ratio` N. Thus a third of the force is
+// -(across N + slide u_t) with across = rho C_n / 12 |u.N| u.N / N.N and slide = rho C_t / 12 |N| |u_t|.
 struct AirDrag {
     static constexpr const char* name = "air_drag";
     static constexpr int inputs = 23, outputs = 9;

@@ -129,7 +129,8 @@ struct Orthotropic {
     static constexpr int coefficients = 8;
     template <class T>
     static constexpr Stress<T> stress(Metric<T> g, const T* c) {
-        const T mu = c[0], lam = c[1], balance = c[2], warp = c[3], weft = c[4], warp_toe = c[5], weft_toe = c[6], reach = c[7];
+        const T mu = c[0], lam = c[1], balance = c[2], warp = c[3], weft = c[4], warp_toe = c[5], weft_toe = c[6],
+                reach = c[7];
         const T length1 = sqrt(g.warp), length2 = sqrt(g.weft);
         const T e1 = length1 - 1.0, e2 = length2 - 1.0;
         const T more = balance - 1.0, fewer = 1.0 / balance - 1.0;

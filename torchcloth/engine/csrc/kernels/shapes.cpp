@@ -116,7 +116,8 @@ struct CylinderDistance {
         const T half = r.number(), height = dot(q, axis);
         const auto barrel = polar(q - height * axis, r.vec());
         // there is no third pair of sides: so far inside that it never counts
-        const auto [distance, part] = block_distance(Vec<T>{barrel.length - radius, abs(height) - half, constant(half, -1e30)});
+        const auto [distance, part] =
+            block_distance(Vec<T>{barrel.length - radius, abs(height) - half, constant(half, -1e30)});
         const T top = select(less(height, 0.0), -part.y, part.y);
         write(out, distance, part.x * barrel.direction + top * axis);
     }

@@ -25,7 +25,7 @@ struct Surface {
     }
 };
 
-// Edges from the first corner, from the corners and their compensation in float32. dynamics/model.py, `surface`
+// Edges from the first corner, from the corners and their compensation in float32. dynamics/kinematics.py, `surface`
 struct CompensatedEdges {
     static constexpr const char* name = "compensated_edges";
     static constexpr int inputs = 18, outputs = 6;
