@@ -67,6 +67,14 @@ def check_layer(namespace: dict[str, Any]) -> None:
     assert namespace["cloth"].material.youngs_modulus.raw.grad.abs().item() > 0
 
 
+def check_shirt(namespace: dict[str, Any]) -> None:
+    """Check that the held shoulder follows the hand, and that no vertex falls through the table."""
+    frames, shoulder = namespace["lifted"], namespace["mesh"].places["left shoulder"]
+    assert torch.isfinite(frames).all()
+    torch.testing.assert_close(frames[-1, shoulder, 2] - frames[0, shoulder, 2], torch.full((len(shoulder),), 0.04))
+    assert float(frames[..., 2].min()) > -0.0061
+
+
 def check_arm(namespace: dict[str, Any]) -> None:
     assert namespace["rig"]["hand"].frame == "tip"
     assert set(namespace["plan"].q) == {"hand"}
@@ -102,6 +110,7 @@ def check_tutorial(namespace: dict[str, Any]) -> None:
 
 
 CHECK |= {
+    "docs/how-to/use-the-layer.md": check_shirt,
     "README.md": check_layer,
     "docs/how-to/own-arm.md": check_arm,
     "docs/how-to/import-recordings.md": check_imports,
