@@ -1,4 +1,4 @@
-"""Patches that end between vertices."""
+"""Meshes whose gripped patches end between vertices."""
 
 from dataclasses import replace
 

@@ -1,4 +1,4 @@
-"""What repetitions differ by, and cells that jump between shapes of the cloth."""
+"""Floor from repeated motions, and bins whose response is discontinuous."""
 
 from dataclasses import replace
 

@@ -1,4 +1,4 @@
-"""Cloth that ripples: a fit must not stop where a small step makes other ripples. Without roughness it does."""
+"""Roughness: without it, a fit of rippling cloth stops where a small step changes the ripples."""
 
 import math
 from dataclasses import replace

@@ -1,4 +1,4 @@
-"""Arms are asked what they can do of an experiment, and the proposed one becomes an episode to drive them by."""
+"""Feasibility of an experiment for the arms, and its conversion to an episode that drives them."""
 
 import shutil
 from dataclasses import replace

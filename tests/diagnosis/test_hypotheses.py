@@ -1,4 +1,4 @@
-"""Hypotheses as changes of a world: nothing at zero, continuous from there, and of the stated sign and size."""
+"""Hypotheses change a world: by nothing at zero, continuously from there, with the stated sign and size."""
 
 from dataclasses import replace
 from types import SimpleNamespace

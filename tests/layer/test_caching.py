@@ -1,4 +1,4 @@
-"""What was asked for last is found again, and only that."""
+"""Results of the last requests are cached, and returned only for the same request."""
 
 import pytest
 import torch

@@ -1,4 +1,4 @@
-"""Drifts of forces on linear toys: what all motions share is seen, what depends on the motion is not."""
+"""Force drift on linear examples: a drift that all motions share is found, one that depends on the motion is not."""
 
 from dataclasses import replace
 

@@ -1,4 +1,4 @@
-"""Lack of fit on linear toys: what a right model leaves is called so, what it does not is not."""
+"""Lack of fit on linear examples: its size and p-value with right and with wrong models."""
 
 from dataclasses import replace
 from types import SimpleNamespace

@@ -1,4 +1,4 @@
-"""What is mislabelled, contradictory or incomplete is refused in one line that says what to do."""
+"""Mislabelled, contradictory or incomplete files are refused in one line that names the remedy."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Experiments are those that the independent engine can carry out, and the proposed one tells causes apart."""
+"""Proposed experiments can be carried out by the independent engine and distinguish causes."""
 
 import json
 import subprocess

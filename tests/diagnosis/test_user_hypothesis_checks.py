@@ -1,4 +1,4 @@
-"""Causes of one's own that misbehave are told before anything long is simulated."""
+"""Faults in a user's causes are reported before any long simulation."""
 
 import math
 from dataclasses import replace
@@ -26,14 +26,20 @@ def fails(*_):
 
 WRONG = {
     "nothing": (lambda w, a: None, "TypeError: apply gives NoneType, no World"),
-    "divides": (fails, "ZeroDivisionError: division by zero in .*test_tried_causes.py, line"),
-    "a motion": (lambda w, a: w.with_motion_transform(fails), "ZeroDivisionError: .*test_tried_causes.py, line"),
-    "a view": (lambda w, a: w.with_observation_transform(fails), "ZeroDivisionError: .*test_tried_causes.py, line"),
+    "divides": (fails, "ZeroDivisionError: division by zero in .*test_user_hypothesis_checks.py, line"),
+    "a motion": (
+        lambda w, a: w.with_motion_transform(fails),
+        "ZeroDivisionError: .*test_user_hypothesis_checks.py, line",
+    ),
+    "a view": (
+        lambda w, a: w.with_observation_transform(fails),
+        "ZeroDivisionError: .*test_user_hypothesis_checks.py, line",
+    ),
     "a view of one episode": (
         lambda w, a: w.with_observation_transform(
             lambda frames, e: fails() if float(e.motion["left"].pose[3, 1, 3]) > 0.005 else frames
         ),
-        "ZeroDivisionError: .*test_tried_causes.py, line",
+        "ZeroDivisionError: .*test_user_hypothesis_checks.py, line",
     ),
     "no numbers": (
         lambda w, a: w.with_observation_transform(lambda frames, e: frames._replace(x=frames.x * math.nan)),

@@ -1,4 +1,4 @@
-"""Answers that are kept: found again, written whole, and never taken for those of another question or problem."""
+"""Stored results are found again, are written whole, and are never used for another problem."""
 
 import os
 from dataclasses import replace

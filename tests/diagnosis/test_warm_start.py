@@ -1,4 +1,4 @@
-"""From a data sheet that is off to where slopes hold."""
+"""Parabolas lead the warm start from a wrong data sheet to where slopes are valid."""
 
 import pytest
 import torch

@@ -1,4 +1,4 @@
-"""A cause shows where it does what nothing else that is fitted could do."""
+"""Localisation: a cause shows in bins that no other fitted quantity explains."""
 
 from dataclasses import replace
 from types import SimpleNamespace

@@ -1,4 +1,4 @@
-"""Noise, screening, classes and comparison on linear toys: against theory, and against what must not matter."""
+"""Noise, score tests, confounding and comparison on linear examples, against theory."""
 
 import math
 from dataclasses import replace

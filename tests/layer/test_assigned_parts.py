@@ -1,4 +1,4 @@
-"""What is put in, copied or taken out later is held to what the constructor asks for."""
+"""Parts that are assigned, copied or removed later pass the same checks as in the constructor."""
 
 import copy
 import math

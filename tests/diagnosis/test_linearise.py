@@ -1,4 +1,4 @@
-"""Slopes of what would be seen, along the model's numbers and along causes."""
+"""Slopes of observations along the model's parameters and along causes."""
 
 from dataclasses import replace
 

@@ -1,4 +1,4 @@
-"""Faults planted in another engine's episodes are named; effects that a diagnosis looks for are none."""
+"""Data checks name faults planted in another engine's episodes, and pass the effects that a diagnosis looks for."""
 
 import json
 import re

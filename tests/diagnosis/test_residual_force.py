@@ -1,4 +1,4 @@
-"""A force that is learned for an effect which the catalogue lacks, and none where nothing is missing."""
+"""A force that is learned for an effect outside the catalogue, and none where nothing is missing."""
 
 import json
 

@@ -1,4 +1,4 @@
-"""A number that has left its data sheet: the fit begins there again, with the causes that are known by now."""
+"""Restarts: a parameter far from its data sheet is fitted again from there, with the causes known by then."""
 
 from dataclasses import dataclass, replace
 from types import SimpleNamespace

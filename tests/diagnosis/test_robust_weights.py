@@ -1,4 +1,4 @@
-"""Stretches of time that go another way: weights against the formula, and what they are for."""
+"""Robust weights of time blocks: against the formula, and on stretches that a wrong model distorts."""
 
 from dataclasses import replace
 

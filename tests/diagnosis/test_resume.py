@@ -1,4 +1,4 @@
-"""A diagnosis that was stopped anywhere goes on where it was, and answers the same bit by bit."""
+"""A stopped diagnosis resumes and gives the same result bit by bit."""
 
 import json
 from dataclasses import replace

@@ -1,4 +1,4 @@
-"""A force planted in a known part of the cloth for a known time, on another mesh, is found there and then."""
+"""A force planted in part of the cloth for part of the time, on another mesh, is located."""
 
 import pytest
 import torch

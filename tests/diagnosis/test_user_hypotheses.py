@@ -1,4 +1,4 @@
-"""Causes of a user's own come from a file: on the command line, and again where a model that has them is loaded."""
+"""A user's causes are read from a file by the command, and again where a model that has them is loaded."""
 
 import math
 import re

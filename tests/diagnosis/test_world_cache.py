@@ -1,4 +1,4 @@
-"""Worlds about a model's point are made once, whoever asks, and are those that the model makes."""
+"""Worlds at and around a model's point are built once and equal those that the model builds."""
 
 from concurrent.futures import ThreadPoolExecutor
 

@@ -1,4 +1,4 @@
-"""Numbers of a law about which motions disagree, and what is then begun."""
+"""Parameters about which motions disagree, and the searches that start from them."""
 
 from dataclasses import replace
 

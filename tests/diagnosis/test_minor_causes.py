@@ -1,4 +1,4 @@
-"""What is too small to matter has no name, but what it may stand for is said; nor has what may be too small."""
+"""Causes below the smallest effect of interest are not named, but what they may stand for is reported."""
 
 from dataclasses import replace
 from types import SimpleNamespace

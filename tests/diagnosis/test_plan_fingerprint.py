@@ -1,4 +1,4 @@
-"""The fingerprint of what was decided beforehand: the same again, and another for every decision."""
+"""The fingerprint of a plan stays the same for the same decisions and changes with every one of them."""
 
 from dataclasses import replace
 

@@ -1,4 +1,4 @@
-"""Causes that stand in for what nobody asked about are withdrawn, where one law does clearly more."""
+"""Causes are withdrawn where one local force law predicts much better."""
 
 from dataclasses import replace
 from types import SimpleNamespace
