@@ -34,9 +34,9 @@ IDENTIFICATION_CONVENTION = (
     "below half of the prior's standard deviation in that coordinate, unless the prior was measured. The fit beats the "
     "null, and its derivatives hold. With refine (default of the command without --profile, not of the function), "
     "values and std include the correction for the mesh. source 'not in the model' or 'held fixed': value, std and "
-    "ci95 are those of the prior. identifiability: rms displacement of the cloth [mm] and rms change of its forces [N] by "
-    "one standard deviation of the prior, and by 10 % of the value. nuisances: what differs from episode to episode, "
-    "in [m], [s], [rad] or [N]."
+    "ci95 are those of the prior. identifiability: rms displacement of the cloth [mm] and rms change of its forces [N] "
+    "by one standard deviation of the prior, and by 10 % of the value. nuisances: what differs from episode to "
+    "episode, in [m], [s], [rad] or [N]."
 )
 
 
