@@ -47,9 +47,6 @@ ONLY = {
 EXCEPTIONS: dict[tuple[str, str], str] = {}
 
 
-ROOMS_WITH_CIRCLES = ("training",)  # force_terms
-
-
 def floor(room: str) -> int:
     for number, rooms in enumerate(FLOORS):
         if room in rooms:
@@ -176,9 +173,7 @@ def imports_within(room: str) -> dict[str, set[str]]:
 
 
 @pytest.mark.parametrize("room", [room for level in FLOORS for room in level])
-def test_no_circle_inside_a_room(room, request):
-    if room in ROOMS_WITH_CIRCLES:
-        request.applymarker(pytest.mark.xfail(strict=False, reason="its circles are not cut yet"))
+def test_no_circle_inside_a_room(room):
     components = circles(imports_within(room))
     assert not components, "\n".join(" <-> ".join(sorted(circle)) for circle in components)
 

@@ -11,9 +11,6 @@ import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
 FOLDERS = ("torchcloth", "robots", "training", "benchmarks")
-# Remove this mark when engine, training and benchmarks keep the rules: ``--runxfail`` lists what is left.
-NOT_ALL_ROOMS_ARE_DONE = pytest.mark.xfail(strict=False, reason="some rooms do not keep the rules yet")
-
 MAX_README_LINES = 170
 MIN_DOCSTRING_WORDS = 4
 
@@ -185,19 +182,16 @@ def report(violations: list[str]) -> str:
     return f"{len(violations)} violations\n" + "\n".join(blocks)
 
 
-@NOT_ALL_ROOMS_ARE_DONE
 def test_no_constant_is_named_by_one_word():
     violations = [line for source in sources() for line in bare_constants(source)]
     assert not violations, report(violations)
 
 
-@NOT_ALL_ROOMS_ARE_DONE
 def test_a_constant_name_has_one_value_everywhere():
     violations = ambiguous_constants(sources())
     assert not violations, report(violations)
 
 
-@NOT_ALL_ROOMS_ARE_DONE
 def test_no_lambda_is_bound_to_a_name():
     violations = [
         f"{source.path}:{number}"
@@ -208,19 +202,16 @@ def test_no_lambda_is_bound_to_a_name():
     assert not violations, report(violations)
 
 
-@NOT_ALL_ROOMS_ARE_DONE
 def test_no_identifier_is_forbidden():
     violations = [line for source in sources() for line in forbidden_identifiers(source)]
     assert not violations, report(violations)
 
 
-@NOT_ALL_ROOMS_ARE_DONE
 def test_public_docstrings_say_something():
     violations = [line for source in sources() for line in short_docstrings(source)]
     assert not violations, report(violations)
 
 
-@NOT_ALL_ROOMS_ARE_DONE
 def test_docstrings_of_functions_begin_with_an_imperative():
     violations = [line for source in sources() for line in docstrings_without_imperative(source)]
     assert not violations, report(violations)

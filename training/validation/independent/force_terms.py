@@ -2,17 +2,28 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import Protocol
 
 import numpy as np
 from scipy.sparse import csr_matrix
 
-from .flex_sheet import rest_positions
-
-if TYPE_CHECKING:
-    from .mujoco_cloth import MujocoCloth
+from .flex_sheet import SheetSpec, rest_positions
 
 Array = np.ndarray
+
+
+class SimulatedSheet(Protocol):
+    """What a force term reads of the cloth that it acts on.
+
+    Attributes:
+        spec: size and nodes of the sheet.
+        faces: [F, 3], indices of the triangles' vertices.
+        uv: [V, 2] m, pattern coordinates.
+    """
+
+    spec: SheetSpec
+    faces: Array
+    uv: Array
 
 
 class ForceTerm:
@@ -29,7 +40,7 @@ class ForceTerm:
     has_inertia = False
     damping_matrix: csr_matrix | None = None
 
-    def reset(self, cloth: MujocoCloth, x: Array) -> None:
+    def reset(self, cloth: SimulatedSheet, x: Array) -> None:
         """Prepare for a run of this cloth from positions x [V, 3] m, and clear all memory."""
 
     def force(self, t: float, x: Array, v: Array) -> Array | float:
@@ -54,7 +65,7 @@ class TriangleOperators:
         mean: [F, V] sparse, values at the centroids.
     """
 
-    def __init__(self, cloth: MujocoCloth) -> None:
+    def __init__(self, cloth: SimulatedSheet) -> None:
         self.faces = cloth.faces
         count, rest = len(cloth.uv), rest_positions(cloth.spec)
         a, b, c = (rest[self.faces[:, k]] for k in range(3))

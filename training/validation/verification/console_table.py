@@ -52,7 +52,7 @@ def show_progress(total: int) -> Iterator[ProgressReport]:
 
 
 def print_table(lines: Sequence[TableLine]) -> None:
-    """Print the table."""
+    """Print the table of all figures."""
     table = Table("case", "", "measured", "truth", "error", "tolerance", "", title="Verification")
     last = None
     for line in lines:
