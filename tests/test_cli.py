@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers.twins import doubles, first, twin
+from helpers.twins import make_twin, take_first_frames, use_float64
 
 from torchcloth import recordings
 from torchcloth.cli import doctor, main
@@ -38,8 +38,8 @@ def call(*arguments, **options):
 @pytest.fixture(scope="session")
 def folder(tmp_path_factory):
     """The twin episode on disk."""
-    with doubles():
-        return recordings.write(first(twin(), 8), tmp_path_factory.mktemp("episodes") / "twin")
+    with use_float64():
+        return recordings.write(take_first_frames(make_twin(), 8), tmp_path_factory.mktemp("episodes") / "twin")
 
 
 @pytest.fixture

@@ -18,9 +18,9 @@ def strips(tmp_path_factory):
     """Folder of a fit of three directions."""
     torch.set_default_dtype(torch.float64)
     draw = np.random.default_rng(0)
-    tables = [off_axis_strips.readings(a, 0.02, draw, count=12) for a in (0, 45, 90)]
+    tables = [off_axis_strips.make_readings(a, 0.02, draw, count=12) for a in (0, 45, 90)]
     folder = tmp_path_factory.mktemp("fits") / "strips"
-    fit_tension(off_axis_strips.cloth(), tables, off_axis_strips.NAMES).save(folder)
+    fit_tension(off_axis_strips.make_start_cloth(), tables, off_axis_strips.MODULUS_NAMES).save(folder)
     return folder
 
 
@@ -28,10 +28,10 @@ def strips(tmp_path_factory):
 def swing(tmp_path_factory):
     """Folder of a fit of an episode, and another episode on disk."""
     folder = tmp_path_factory.mktemp("episodes")
-    with twins.doubles():
-        fitted = twins.first(twins.twin(), 6)
-        identify(twins.at(fitted), fitted, ["youngs_modulus"], iterations=2).save(folder / "fit")
-        other = recordings.write(twins.first(twins.twin(seed=1, amplitude=0.05), 6), folder / "other")
+    with twins.use_float64():
+        fitted = twins.take_first_frames(twins.make_twin(), 6)
+        identify(twins.build_cloth_at(fitted), fitted, ["youngs_modulus"], iterations=2).save(folder / "fit")
+        other = recordings.write(twins.take_first_frames(twins.make_twin(seed=1, amplitude=0.05), 6), folder / "other")
     return folder / "fit", other
 
 
@@ -44,7 +44,7 @@ def test_a_strip_at_any_angle(strips, tmp_path, capsys):
         assert word in printed
     content = json.loads((out / "prediction.json").read_text())
     low, high = np.array(content["force"]["ci95"])
-    truth = off_axis_strips.modulus(30) * off_axis_strips.H * 0.02 * np.array(content["strain"])
+    truth = off_axis_strips.off_axis_modulus(30) * off_axis_strips.THICKNESS_M * 0.02 * np.array(content["strain"])
     assert ((low <= truth) & (truth <= high)).all()
     assert content["measured"] == {}
     assert (out / "prediction.png").stat().st_size > 5000
@@ -54,7 +54,7 @@ def test_a_strip_at_any_angle(strips, tmp_path, capsys):
 
 
 def test_a_table_is_predicted_and_compared_with(strips, tmp_path, capsys):
-    table = off_axis_strips.readings(60, 0.02, np.random.default_rng(1), count=12)
+    table = off_axis_strips.make_readings(60, 0.02, np.random.default_rng(1), count=12)
     place = recordings.write_tension(table, tmp_path / "table")
     assert main(["predict", str(strips / "tension.json"), str(place)]) == 0
     assert "of the readings inside" in capsys.readouterr().out
@@ -80,8 +80,8 @@ def test_another_episode(swing, tmp_path, capsys):
 
 
 def test_the_fitted_episode_is_no_prediction(swing, tmp_path, capsys):
-    with twins.doubles():
-        place = recordings.write(twins.first(twins.twin(), 6), tmp_path / "same")
+    with twins.use_float64():
+        place = recordings.write(twins.take_first_frames(twins.make_twin(), 6), tmp_path / "same")
     assert main(["predict", str(swing[0]), str(place), "--out", str(tmp_path / "out")]) == 0
     assert "the fit used this episode" in capsys.readouterr().out
 
@@ -91,7 +91,9 @@ def test_wrong_input_is_one_line(strips, swing, tmp_path, capsys):
     (tmp_path / "file").write_text("")
     model = tmp_path / "m.tcm"
     model.touch()
-    table = recordings.write_tension(off_axis_strips.readings(60, 0.0, np.random.default_rng(1)), tmp_path / "table")
+    table = recordings.write_tension(
+        off_axis_strips.make_readings(60, 0.0, np.random.default_rng(1)), tmp_path / "table"
+    )
     wrong = {
         ("nothing", "--angle", "30"): "FIT; got .*nothing; expected tension.json, identification.json or",
         (strips,): "--angle; got none; expected degrees",

@@ -44,11 +44,11 @@ def prepare_depth_images(folder: Path) -> dict[str, Any]:
     images = folder / "my_episode" / "cam0" / "depth"
     images.mkdir(parents=True)
     for i in range(2):
-        (images / f"{i:06d}.png").write_bytes(foreign_formats.png(depth))
+        (images / f"{i:06d}.png").write_bytes(foreign_formats.encode_png(depth))
     (images.parent / "timestamps.csv").write_text("frame,t_color,t_depth\n0,,0.0\n1,,0.5\n")
     matrix = [[140.0, 0, 79.5], [0, 140.0, 59.5], [0, 0, 1]]
     size = {"width": 160, "height": 120, "depth_scale": 0.001}
-    message = {**foreign_formats.KNOWN, "format": "torchcloth-recording", "version": 1}
+    message = {**foreign_formats.SCENE_DESCRIPTION, "format": "torchcloth-recording", "version": 1}
     message["cloth"] = message["cloth"] | {"sheet": {"width": 2 * HALF_SHEET_M, "height": 2 * HALF_SHEET_M}}
     message["cameras"] = {"cam0": {**size, "K": matrix, "T_world_camera": pose.tolist()}}
     (folder / "my_episode" / "episode.json").write_text(json.dumps(message))

@@ -19,7 +19,7 @@ def made():
 
     from torchcloth.diagnosis import build_base_model, prepare_data
 
-    before, recording = torch.get_default_dtype(), sheet_episodes.episode()
+    before, recording = torch.get_default_dtype(), sheet_episodes.make_episode()
     torch.set_default_dtype(torch.float64)
     model = build_base_model(recording)
     yield model, prepare_data(model, [recording])

@@ -212,7 +212,7 @@ def test_an_arm_that_was_recorded_with_its_fingers_width_holds_while_they_are_ne
 
 def test_episodes_of_two_cloths_are_refused(turned):
     light = replace(turned, cloth=replace(turned.cloth, areal_density=0.1))
-    with pytest.raises(InvalidInput, match=r"another areal density.*got 0\.1.*expected 0\.25.*apart"):
+    with pytest.raises(InvalidInput, match=r"another areal density.*got 0\.1.*expected 0\.25.*separately"):
         check_episodes([turned, light])
     uv = turned.cloth.uv * 1.5
     with pytest.raises(InvalidInput, match=r"another cloth.*got 0\.45 x 0\.45.*expected 0\.3 x 0\.3"):
@@ -258,7 +258,7 @@ def test_the_verdict_is_written_and_the_command_is_done(turned, tmp_path, capsys
 
 
 def test_a_stream_that_cannot_be_read_is_invalid_data_and_a_missing_folder_is_not(tmp_path, capsys):
-    folders = [str(rec.write(sheet_episodes.episode(motion), tmp_path / motion)) for motion in ("slow", "fast")]
+    folders = [str(rec.write(sheet_episodes.make_episode(motion), tmp_path / motion)) for motion in ("slow", "fast")]
     with np.load(tmp_path / "slow" / "points.npz") as file:
         arrays = dict(file)
     arrays["t"] = arrays["t"][::-1].copy()
@@ -295,7 +295,9 @@ def test_forces_alone_do_not_say_where_the_cloth_goes(turned):
 
 def test_small_episodes_of_the_same_engine_pass():
     torch.set_default_dtype(torch.float64)
-    assert check_episodes([sheet_episodes.episode(motion, duration=0.6) for motion in sheet_episodes.MOTIONS]) == []
+    assert (
+        check_episodes([sheet_episodes.make_episode(motion, duration=0.6) for motion in sheet_episodes.MOTIONS]) == []
+    )
 
 
 @pytest.mark.parametrize("seed", [2, 3])
@@ -309,7 +311,7 @@ def test_a_bar_in_view_is_no_mirror(tmp_path, seed):
 
 def test_an_episode_that_says_nothing_is_refused_by_name(tmp_path, capsys):
     """Two frames, of which the first begins the simulation and the last is what a late clock would see."""
-    good = [sheet_episodes.episode(motion) for motion in ("slow", "fast")]
+    good = [sheet_episodes.make_episode(motion) for motion in ("slow", "fast")]
     points = good[1].points
     short = rec.PointClouds(points.t[:2], points.xyz[: points.counts[:2].sum()], points.counts[:2])
     cut = {name: _until(g, points.t[1] + 0.01) for name, g in good[1].grippers.items()}

@@ -31,7 +31,9 @@ ASKED = ("air.drag_n", "air.linear", "mass.hem", "rest.shrink[weft]", "obs.extri
 
 
 def episodes(change, seed=0):
-    return [sheet_episodes.recorded(motion, change, seed + k) for k, motion in enumerate(sheet_episodes.MOTIONS)]
+    return [
+        sheet_episodes.record_changed_world(motion, change, seed + k) for k, motion in enumerate(sheet_episodes.MOTIONS)
+    ]
 
 
 def asked(recordings):
@@ -42,7 +44,7 @@ def asked(recordings):
 def with_drag():
     before = torch.get_default_dtype()
     torch.set_default_dtype(torch.float64)
-    (hidden,) = (h for h in asked([sheet_episodes.episode()]) if h.name == "air.drag_n")
+    (hidden,) = (h for h in asked([sheet_episodes.make_episode()]) if h.name == "air.drag_n")
     recordings = episodes(lambda world: hidden.apply(world, 1.5))
     yield recordings, diagnose(recordings, hypotheses=asked(recordings))
     torch.set_default_dtype(before)
@@ -75,9 +77,14 @@ def test_a_cause_says_where_and_when_it_shows(with_drag):
     """Drag holds back what is free to move: the lower end of the sheet, and not in the first moment."""
     _, answer = with_drag
     (cause,) = answer.content["causes"]
-    assert cause["where"]["at"][1] < 0.5 * sheet_episodes.SIDE
+    assert cause["where"]["at"][1] < 0.5 * sheet_episodes.SIDE_M
     assert cause["when"]["motion"] in sheet_episodes.MOTIONS
-    assert 0.0 < cause["when"]["from"] < cause["when"]["to"] <= 0.2 + sheet_episodes.FRAMES / sheet_episodes.RATE
+    assert (
+        0.0
+        < cause["when"]["from"]
+        < cause["when"]["to"]
+        <= 0.2 + sheet_episodes.FRAME_COUNT / sheet_episodes.FRAME_RATE_HZ
+    )
     assert 1e-3 < cause["response"]["value"] < 0.1
 
 
@@ -191,7 +198,7 @@ def test_where_nothing_is_hidden_nothing_is_named():
 
 
 def test_one_motion_is_refused(tmp_path, capsys):
-    only = [sheet_episodes.episode(), sheet_episodes.episode(duration=0.5)]
+    only = [sheet_episodes.make_episode(), sheet_episodes.make_episode(duration=0.5)]
     with pytest.raises(InvalidInput, match="at least two motions"):
         diagnose(only)
     with pytest.raises(InvalidInput, match="twice"):  # and not advice to name them apart
@@ -209,7 +216,7 @@ def test_single_precision_is_refused(with_drag):
 
 
 def test_a_model_that_is_none_is_refused(tmp_path, capsys):
-    folder = rec.write(sheet_episodes.episode(), tmp_path / "a")
+    folder = rec.write(sheet_episodes.make_episode(), tmp_path / "a")
     (tmp_path / "m.tcm").write_text("x")
     assert main(["diagnose", str(folder), "--model", str(tmp_path / "m.tcm"), "--out", str(tmp_path / "out")]) == 2
     assert "m.tcm: unreadable" in capsys.readouterr().err

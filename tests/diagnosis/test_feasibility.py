@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 from helpers import sheet_episodes
-from helpers.undecided_search import undecided
+from helpers.undecided_search import make_undecided_search
 
 from torchcloth import recordings, robots
 from torchcloth.diagnosis.experiment import motions, proposal
@@ -58,7 +58,7 @@ def test_an_experiment_is_as_fast_as_the_arms(shipped, slowed):
 
 def test_where_no_arm_is_named_none_is_asked(monkeypatch):
     monkeypatch.setattr(motions, "EXPERIMENTS", (FAST, Experiment("turn", 90.0)))
-    found = check_feasibility([sheet_episodes.episode()], lambda _: pytest.fail("an arm was asked"))
+    found = check_feasibility([sheet_episodes.make_episode()], lambda _: pytest.fail("an arm was asked"))
     assert [c.experiment for c in found] == [FAST, Experiment("turn", 90.0)]
     assert {(c.plan, c.why_not, c.not_checked) for c in found} == {(None, None, None)}
 
@@ -69,7 +69,7 @@ def test_what_is_in_the_arms_way_is_said_and_not_proposed(shipped, monkeypatch):
     paths = {name: robots.to_gripper_motion(path) for name, path in robots.replay(shipped).items()}
     (refused,) = check_feasibility([replace(shipped, grippers=paths, joints={}, robots=far)], quiet)
     assert "reach" in refused.why_not
-    found, content, setting = undecided(("env.gravity_tilt[y]", "obs.rotation[x]"))
+    found, content, setting = make_undecided_search(("env.gravity_tilt[y]", "obs.rotation[x]"))
     turn = FeasibleExperiment(Experiment("turn", -90.0), make_episode(Experiment("turn", -90.0), setting.recordings[0]))
     hang = replace(refused, experiment=Experiment("hang"))
     monkeypatch.setattr(proposal, "check_feasibility", lambda *_: [hang, turn])
@@ -96,7 +96,7 @@ def test_the_proposed_one_is_an_episode_without_blanks(slowed, tmp_path):
 
 
 def test_a_proposal_replaces_the_last_one_and_nothing_that_was_recorded(slowed, tmp_path):
-    hang = make_episode(Experiment("hang"), sheet_episodes.episode())
+    hang = make_episode(Experiment("hang"), sheet_episodes.make_episode())
     assert write_episode(hang, tmp_path) is None
     assert write_episode(slowed.episode, tmp_path) is None
     assert recordings.read(tmp_path / EXPERIMENT_FOLDER).split == slowed.episode.split

@@ -17,7 +17,7 @@ from torchcloth.episodes.world import World
 from torchcloth.episodes.world_cache import WorldCache
 from torchcloth.identification.nuisances import GraspOffset
 
-RECORDING = sheet_episodes.episode()
+RECORDING = sheet_episodes.make_episode()
 
 
 @pytest.fixture(scope="module")

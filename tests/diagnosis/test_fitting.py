@@ -22,7 +22,7 @@ def looks(monkeypatch):
 
     Worlds beyond ``looks.edge`` are impossible, windows before ``looks.hidden`` are not met at 0.
     """
-    there = toys.fitted(toys.evidence(toys.smooth(1, 2), 1, [], TRUTH, 0))
+    there = toys.make_model_fit(toys.draw_linearisation(toys.draw_jacobian(1, 2), 1, [], TRUTH, 0))
 
     class Looks(list):
         edge, hidden = torch.inf, 0
@@ -51,7 +51,7 @@ def looks(monkeypatch):
 
 def test_it_ends_where_the_data_are_and_asks_there(looks):
     seen, model = looks
-    found = fit(model, None, [toys.hypothesis("a")])  # type: ignore[arg-type]
+    found = fit(model, None, [toys.make_hypothesis("a")])  # type: ignore[arg-type]
     assert float(found.model.point[0]) == pytest.approx(0.4, abs=4 * float(found.covariance[0, 0]) ** 0.5)
     assert [count for _, count in seen] == [0] * (len(seen) - 1) + [1]
     assert seen[-1][0] == float(found.model.point[0])
@@ -61,7 +61,7 @@ def test_it_ends_where_the_data_are_and_asks_there(looks):
 def test_a_step_into_the_impossible_is_not_taken(looks, iterations):
     seen, model = looks
     seen.edge = 0.1
-    found = fit(model, None, [toys.hypothesis("a")], iterations)  # type: ignore[arg-type]
+    found = fit(model, None, [toys.make_hypothesis("a")], iterations)  # type: ignore[arg-type]
     assert float(found.model.point[0]) == 0.0
     assert [h.name for h in found.linearisation.hypotheses] == ["a"]
     assert seen[-1] == (0.0, 1)
@@ -84,7 +84,7 @@ def test_causes_are_asked_about_where_it_ends_alone(looks, monkeypatch):
     """Simulating all of them at a step that loses takes longer than the step."""
     seen, model = looks
     monkeypatch.setattr(fitting, "robust_step", lambda *_: (torch.tensor([0.9]).double(), 9.0))
-    found = fit(model, None, [toys.hypothesis("a")], 1)  # type: ignore[arg-type]
+    found = fit(model, None, [toys.make_hypothesis("a")], 1)  # type: ignore[arg-type]
     assert seen == [(0.0, 0), (0.9, 0), (0.0, 1)]
     assert [h.name for h in found.linearisation.hypotheses] == ["a"]
 
@@ -134,12 +134,14 @@ def test_what_is_known_is_not_looked_at_again(looks):
 
 def test_a_twin_takes_over_what_the_parameter_did():
     """The same world, with the parameter back at its data sheet."""
-    slopes = toys.smooth(1, 3)
+    slopes = toys.draw_jacobian(1, 3)
     slopes[..., 1] = slopes[..., 0]
-    there = toys.fitted(toys.evidence(slopes, 1, ["twin"], torch.tensor([0.0, 0.0]).double(), 0), std=0.05)
+    there = toys.make_model_fit(
+        toys.draw_linearisation(slopes, 1, ["twin"], torch.tensor([0.0, 0.0]).double(), 0), std=0.05
+    )
     sheet = replace(there.model.parameters[0], value=math.exp)
     model = replace(there.model, parameters=(sheet,)).at_point(torch.tensor([math.log(1.2)]).double())
-    twin = toys.hypothesis("twin", equivalent_parameter=sheet.name)
+    twin = toys.make_hypothesis("twin", equivalent_parameter=sheet.name)
     found = add_cause(replace(there, model=model, linearisation=replace(there.linearisation, hypotheses=[twin])), twin)
     amplitude, coordinate = found.amplitudes[0], float(found.coordinates[0])
     assert amplitude + coordinate == pytest.approx(0.2, abs=0.1)
@@ -147,8 +149,8 @@ def test_a_twin_takes_over_what_the_parameter_did():
 
 
 def test_amplitudes_stop_where_a_world_ends():
-    model = toys.fitted(toys.evidence(toys.smooth(1, 2), 1, [], TRUTH, 0)).model
-    ortho = toys.hypothesis("elas.ortho", max_amplitude=0.9)
+    model = toys.make_model_fit(toys.draw_linearisation(toys.draw_jacobian(1, 2), 1, [], TRUTH, 0)).model
+    ortho = toys.make_hypothesis("elas.ortho", max_amplitude=0.9)
     assert model.with_hypothesis(ortho).at_point(torch.tensor([0.1, 1.5]).double()).amplitudes == (0.9,)
     plain = replace(ortho, signed=False, min_amplitude=0.1)
     assert model.with_hypothesis(plain).at_point(torch.tensor([0.1, -1.5]).double()).amplitudes == (0.1,)
@@ -156,7 +158,7 @@ def test_amplitudes_stop_where_a_world_ends():
 
 def test_cells_that_the_base_model_had_not_keep_their_nuisances():
     """They would err by noise alone, however late the clock may be."""
-    here = toys.fitted(toys.evidence(toys.smooth(1, 2), 1, [], TRUTH, 0)).linearisation
+    here = toys.make_model_fit(toys.draw_linearisation(toys.draw_jacobian(1, 2), 1, [], TRUTH, 0)).linearisation
     later = [c.select(c.window > 0) for c in here.bins]
     known = replace(here, bins=[c._replace(jacobian=2 * c.jacobian) for c in later])
     for own, held, like in zip(here.bins, use_nuisance_slopes(here, known).bins, known.bins, strict=True):
@@ -167,7 +169,9 @@ def test_cells_that_the_base_model_had_not_keep_their_nuisances():
 
 
 def test_what_cannot_be_simulated_beside_a_cause_is_told():
-    there = toys.fitted(toys.evidence(toys.smooth(1, 4), 1, ["a", "b"], torch.zeros(3).double(), 0))
-    asked = [toys.hypothesis(name) for name in "abcd"]
+    there = toys.make_model_fit(
+        toys.draw_linearisation(toys.draw_jacobian(1, 4), 1, ["a", "b"], torch.zeros(3).double(), 0)
+    )
+    asked = [toys.make_hypothesis(name) for name in "abcd"]
     model = replace(there.model, accepted=(asked[2],), amplitudes=(0.1,))
     assert _list_not_simulated(replace(there, model=model), asked) == ["d"]

@@ -14,14 +14,16 @@ from torchcloth.diagnosis.inference.force_drift import _pool_motions
 from torchcloth.diagnosis.inference.noise import Noise
 
 TARE = 0.1  # N
-SLOPES = torch.zeros(toys.EPISODES, len(toys.grid().value), 2).double()
-SLOPES[..., 1] = (toys.grid().channel // 3 % 3 == 2).double()  # what differs from episode to episode: forces along z
+SLOPES = torch.zeros(toys.EPISODE_COUNT, len(toys.make_cells().value), 2).double()
+SLOPES[..., 1] = (
+    toys.make_cells().channel // 3 % 3 == 2
+).double()  # what differs from episode to episode: forces along z
 
 
 def evidence(seed, *rates):
     """Forces of five grippers and one axis more in each episode, which grow along z by a rate [N/s] for each."""
     rng = torch.Generator().manual_seed(seed)
-    blank = toys.evidence(SLOPES, 1, [], torch.zeros(1).double(), seed)
+    blank = toys.draw_linearisation(SLOPES, 1, [], torch.zeros(1).double(), seed)
     level = torch.tensor([CRITERIA.adequacy.sensor_error[name] for name in BLOCK_NAMES]).double()
     cells, std = [], torch.tensor([TARE]).double()
     for c, rate in zip(blank.bins, rates, strict=False):
@@ -35,12 +37,12 @@ def evidence(seed, *rates):
 
 
 def told(seed, *rates, names="abcd"):
-    return estimate_force_drifts(toys.fitted(evidence(seed, *rates)), names)
+    return estimate_force_drifts(toys.make_model_fit(evidence(seed, *rates)), names)
 
 
 def test_an_axis_of_which_too_few_motions_know_is_left_out():
     """Cells of one axis may all jump, or all of an episode."""
-    whole = evidence(3, *[0.1] * toys.EPISODES)
+    whole = evidence(3, *[0.1] * toys.EPISODE_COUNT)
 
     def less(c, keep):
         return type(c)(*(column[keep] for column in c))
@@ -55,22 +57,22 @@ def test_an_axis_of_which_too_few_motions_know_is_left_out():
 def _of(evidence, cells):
     numerics = [n[: len(c.value)] for n, c in zip(evidence.mesh_differences, cells, strict=True)]
     return estimate_force_drifts(
-        toys.fitted(replace(evidence, bins=cells, mesh_differences=numerics)), range(toys.EPISODES)
+        toys.make_model_fit(replace(evidence, bins=cells, mesh_differences=numerics)), range(toys.EPISODE_COUNT)
     )
 
 
 def test_a_right_model_drifts_by_chance_as_often_as_it_says():
-    rows = [row for seed in range(60) for row in told(seed, *[0.0] * toys.EPISODES)]
+    rows = [row for seed in range(60) for row in told(seed, *[0.0] * toys.EPISODE_COUNT)]
     size = torch.tensor([row.rate / row.std for row in rows])
     assert 0.7 < float(size.square().mean()) < 1.1  # what episodes differ by makes it a little careful
     assert sum(row.is_significant for row in rows) <= 2
 
 
 def test_what_all_motions_share_is_seen_though_none_shows_it():
-    x, y, z = told(0, *[-0.03] * toys.EPISODES)
+    x, y, z = told(0, *[-0.03] * toys.EPISODE_COUNT)
     assert [row.is_significant for row in (x, y, z)] == [False, False, True]
     assert z.rate == pytest.approx(-0.03, abs=3 * z.std)
-    assert z.std * toys.EPISODES**0.5 > 0.3 * 0.03  # two or three standard errors in each
+    assert z.std * toys.EPISODE_COUNT**0.5 > 0.3 * 0.03  # two or three standard errors in each
 
 
 def test_what_depends_on_the_motion_is_no_drift():
@@ -93,16 +95,21 @@ def test_three_motions_may_be_alike_by_chance():
 
 
 def test_repetitions_of_a_motion_are_no_other_motions():
-    assert told(0, *[-0.03] * toys.EPISODES, names="abca") == []
+    assert told(0, *[-0.03] * toys.EPISODE_COUNT, names="abca") == []
 
 
 def test_where_meshes_fold_apart_no_force_is_judged():
-    ev = evidence(0, *[-0.03] * toys.EPISODES)
+    ev = evidence(0, *[-0.03] * toys.EPISODE_COUNT)
     seen = replace(ev, bins=[c._replace(block=torch.where(c.window == 0, 0, c.block)) for c in ev.bins])
-    assert estimate_force_drifts(toys.fitted(seen), "abcd") != []
+    assert estimate_force_drifts(toys.make_model_fit(seen), "abcd") != []
     apart = replace(seen, mesh_differences=[torch.full_like(n, 1.0) for n in ev.mesh_differences])
-    assert estimate_force_drifts(toys.fitted(apart), "abcd") == []
+    assert estimate_force_drifts(toys.make_model_fit(apart), "abcd") == []
 
 
 def test_without_forces_nothing_is_said():
-    assert estimate_force_drifts(toys.fitted(toys.evidence(SLOPES, 1, [], torch.zeros(1).double(), 0)), "abcd") == []
+    assert (
+        estimate_force_drifts(
+            toys.make_model_fit(toys.draw_linearisation(SLOPES, 1, [], torch.zeros(1).double(), 0)), "abcd"
+        )
+        == []
+    )

@@ -23,7 +23,7 @@ RADIUS = 0.051  # m, of sheets.py: 1.5 edges of the mesh
 def made():
     before = torch.get_default_dtype()
     torch.set_default_dtype(torch.float64)
-    blank = sheet_episodes.episode()
+    blank = sheet_episodes.make_episode()
     model = dx.build_base_model(blank)
     yield model, prepare_data(model, [blank]).episodes[0], blank
     torch.set_default_dtype(before)
@@ -52,7 +52,7 @@ def test_the_edge_of_a_patch_goes_along_and_the_outline_stays(made, along):
 def test_a_wider_patch_grows_on_all_sides_and_the_next_grows_from_there(made):
     world = made[0].build_world()
     wider = move_grip_patches(world, wider=0.01)
-    far = lambda w: np.linalg.norm(held(w, "left") - [0.0, sheet_episodes.SIDE], axis=1)  # noqa: E731
+    far = lambda w: np.linalg.norm(held(w, "left") - [0.0, sheet_episodes.SIDE_M], axis=1)  # noqa: E731
     np.testing.assert_allclose(far(wider), far(world) * (RADIUS + 0.01) / RADIUS)
     both = move_grip_patches(wider, wider=0.01)
     np.testing.assert_allclose(far(both), far(world) * (RADIUS + 0.02) / RADIUS)
@@ -96,7 +96,7 @@ def test_a_model_of_an_episode_starts_where_the_episode_says(made, tmp_path):
     u, bulge, v = (first - torch.tensor([0.0, 0.0, 1.0])).T.numpy()
     np.testing.assert_allclose(np.stack([u, v], 1), cloth.mesh.uv, atol=1e-6)
     np.testing.assert_allclose(bulge, 0.01 * np.sin(8 * cloth.mesh.uv[:, 0]), atol=1e-4)
-    seen = sheet_episodes.recorded("fast", lambda world: world, 3)
+    seen = sheet_episodes.record_changed_world("fast", lambda world: world, 3)
     found = dx.predict_episode(path, rec.read(rec.write(seen, tmp_path / "fast")))
     world = dx.load_world(path)
     torch.testing.assert_close(found.frames.x, world.simulate_observed(build_episode(model.base.cloth, seen)).x)

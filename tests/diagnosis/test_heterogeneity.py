@@ -17,10 +17,10 @@ NAMES = ["a", "b", "c", "d"]
 
 def fitted(apart, name="bending.stiffness"):
     """Four motions, each of which wants a law's number by so much more or less than the others."""
-    ev = toys.evidence(toys.smooth(1, 3), 2, [], torch.tensor([0.0, 0.0]).double(), 0)
+    ev = toys.draw_linearisation(toys.draw_jacobian(1, 3), 2, [], torch.tensor([0.0, 0.0]).double(), 0)
     for k, c in enumerate(ev.bins):
         ev.bins[k] = c._replace(value=c.value - (1, -1, 1, -1)[k] * apart * c.jacobian[:, 1])
-    there = toys.fitted(ev)
+    there = toys.make_model_fit(ev)
     parameters = (there.model.parameters[0], replace(there.model.parameters[1], name=name))
     return replace(
         there, model=replace(there.model, parameters=parameters, coordinates=torch.tensor([0.2, -0.4]).double())

@@ -35,7 +35,7 @@ from torchcloth.meshes import rectangle
 from torchcloth.recordings import Collider, Markers
 from torchcloth.recordings.consistency import merge_scene
 
-RECORDING = sheet_episodes.episode()
+RECORDING = sheet_episodes.make_episode()
 
 
 EVERY = [*air.HYPOTHESES, *fabric.HYPOTHESES, *grip.HYPOTHESES, *observer.HYPOTHESES]
@@ -84,7 +84,7 @@ def test_air_and_hem_do_what_their_names_say(made):
     assert float((last("env.gravity_tilt[x]", 0.2) - base)[free, 0].mean()) > 1e-5
     assert float((last("rest.shrink[weft]", 0.05) - base)[free, 2].mean()) > 1e-3
     torch.testing.assert_close(last("obs.extrinsic[x]", 0.004) - base, torch.tensor([0.004, 0.0, 0.0]).expand_as(base))
-    depth = lambda x: (x - torch.as_tensor(sheet_episodes.EYE)).norm(dim=-1)  # noqa: E731
+    depth = lambda x: (x - torch.as_tensor(sheet_episodes.CAMERA_POSITION_M)).norm(dim=-1)  # noqa: E731
     torch.testing.assert_close(depth(last("obs.depth_scale", 0.015)), 1.015 * depth(base))
     torch.testing.assert_close(depth(last("obs.depth_bias", 5e-3)), depth(base) + 5e-3)
 
@@ -390,7 +390,7 @@ def test_a_table_that_leans_or_stands_rubs_otherwise_along_an_axis_of_its_own(no
 
 def test_a_late_clock_sees_only_frames_that_were_simulated():
     """Of the last ones, which it would see beyond the motion's end, no points are used."""
-    recording = sheet_episodes.recorded("fast", lambda world: world, 4)
+    recording = sheet_episodes.record_changed_world("fast", lambda world: world, 4)
     model = build_base_model(recording)
     (e,) = prepare_data(model, [recording]).episodes
     used = torch.tensor([len(c) > 0 for c in e.clouds])
@@ -412,16 +412,16 @@ def test_a_late_clock_sees_only_frames_that_were_simulated():
 def test_a_seam_is_the_same_on_every_mesh(columns):
     """Where no line of vertices lies in the middle, too."""
     seam = next(h for h in fabric.HYPOTHESES if h.name == "mass.seam")
-    model = build_base_model(sheet_episodes.episode(resolution=(columns, 7)))
+    model = build_base_model(sheet_episodes.make_episode(resolution=(columns, 7)))
     for world in (model.build_world(), refine_model(model, [])[0].build_world()):
         mass = (
             (seam.apply(world, 0.02).cloth.build_model().mass - world.cloth.build_model().mass)[:, 0].detach().numpy()
         )
-        assert mass.sum() == pytest.approx(0.02 * sheet_episodes.SIDE, rel=1e-6)
-        assert mass @ world.cloth.mesh.uv[:, 0] / mass.sum() == pytest.approx(sheet_episodes.SIDE / 2, abs=1e-6)
+        assert mass.sum() == pytest.approx(0.02 * sheet_episodes.SIDE_M, rel=1e-6)
+        assert mass @ world.cloth.mesh.uv[:, 0] / mass.sum() == pytest.approx(sheet_episodes.SIDE_M / 2, abs=1e-6)
         assert np.abs(
-            world.cloth.mesh.uv[mass > 1e-9, 0] - sheet_episodes.SIDE / 2
-        ).max() < 0.7 * sheet_episodes.SIDE / (columns - 1)
+            world.cloth.mesh.uv[mass > 1e-9, 0] - sheet_episodes.SIDE_M / 2
+        ).max() < 0.7 * sheet_episodes.SIDE_M / (columns - 1)
 
 
 def test_drag_beside_wind_says_what_it_counts_from(made):

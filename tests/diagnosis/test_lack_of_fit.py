@@ -13,19 +13,19 @@ from torchcloth.diagnosis.decide.criteria import CRITERIA
 from torchcloth.diagnosis.inference.lack_of_fit import LackOfFit, compare_misfit, has_lack_of_fit
 
 NAMES = ["a"]
-SLOPES = toys.smooth(1, 4)  # two parameters, one hypothesis, one nuisance
-MOTIONS = [f"motion {k}" for k in range(toys.EPISODES)]
+SLOPES = toys.draw_jacobian(1, 4)  # two parameters, one hypothesis, one nuisance
+MOTIONS = [f"motion {k}" for k in range(toys.EPISODE_COUNT)]
 
 
 @pytest.fixture(autouse=True)
 def _sensor(monkeypatch):
     """The toys' slow errors are known."""
-    monkeypatch.setitem(CRITERIA.adequacy.sensor_error, "points", toys.SLOW)
+    monkeypatch.setitem(CRITERIA.adequacy.sensor_error, "points", toys.SLOW_ERROR_M)
 
 
 def left(truth, seed):
     return measure_lack_of_fit(
-        toys.fitted(toys.evidence(SLOPES, 2, NAMES, torch.tensor(truth).double(), seed)), MOTIONS
+        toys.make_model_fit(toys.draw_linearisation(SLOPES, 2, NAMES, torch.tensor(truth).double(), seed)), MOTIONS
     )
 
 
@@ -41,12 +41,14 @@ def test_of_a_right_model_the_chances_are_what_they_say():
 
 def test_the_effective_number_of_cells_is_far_from_their_count():
     (row, *_) = left([0.0, 0.0, 0.0], 0)
-    assert 4 < row.effective_bins < 0.5 * toys.PATCHES * toys.WINDOWS
+    assert 4 < row.effective_bins < 0.5 * toys.PATCH_COUNT * toys.WINDOW_COUNT
 
 
 def test_what_nothing_explains_is_lacking_and_what_parameters_do_is_not():
     assert all(row.is_significant for row in left([0.0, 0.0, 2.0], 0))  # 7 mm RMS
-    found = toys.fitted(toys.evidence(SLOPES, 2, NAMES, torch.tensor([0.3, -0.3, 0.0]).double(), 0), std=0.5)
+    found = toys.make_model_fit(
+        toys.draw_linearisation(SLOPES, 2, NAMES, torch.tensor([0.3, -0.3, 0.0]).double(), 0), std=0.5
+    )
     free = torch.eye(2).double()
     rows = measure_lack_of_fit(replace(found, covariance=free), MOTIONS)
     assert not any(row.is_significant for row in rows)
@@ -60,9 +62,9 @@ def test_small_excess_is_no_lack_even_where_it_is_certain():
 
 def between_meshes(difference):
     """3 mm RMS that nothing explains, and so much between both meshes."""
-    ev = toys.evidence(SLOPES, 2, NAMES, torch.tensor([0.0, 0.0, 0.9]).double(), 0)
+    ev = toys.draw_linearisation(SLOPES, 2, NAMES, torch.tensor([0.0, 0.0, 0.9]).double(), 0)
     rough = [torch.full_like(c.value, difference) for c in ev.bins]
-    return measure_lack_of_fit(toys.fitted(replace(ev, mesh_differences=rough)), MOTIONS)
+    return measure_lack_of_fit(toys.make_model_fit(replace(ev, mesh_differences=rough)), MOTIONS)
 
 
 def test_numerics_are_expected_to_leave_their_share():
@@ -80,35 +82,41 @@ def test_where_meshes_fold_apart_nothing_is_judged():
 @pytest.mark.parametrize(("folded", "share"), [(0, 0.75), (2, 0.5), (3, 0.75)])
 def test_where_most_motions_fold_apart_what_is_held_out_says_how_much_is_mended(folded, share):
     """Three of four motions are put right; of two that are judged one."""
-    wrong, right = (toys.evidence(SLOPES, 2, NAMES, torch.tensor([0.0, 0.0, a]).double(), 0) for a in (3.0, 0.0))
+    wrong, right = (
+        toys.draw_linearisation(SLOPES, 2, NAMES, torch.tensor([0.0, 0.0, a]).double(), 0) for a in (3.0, 0.0)
+    )
     rough = [torch.full_like(c.value, 0.03 if k < folded else 0.0) for k, c in enumerate(wrong.bins)]
-    start = toys.fitted(replace(wrong, mesh_differences=rough))
-    end = toys.fitted(replace(wrong, bins=[*right.bins[:3], wrong.bins[3]], mesh_differences=rough))
+    start = toys.make_model_fit(replace(wrong, mesh_differences=rough))
+    end = toys.make_model_fit(replace(wrong, bins=[*right.bins[:3], wrong.bins[3]], mesh_differences=rough))
     assert backward_elimination.fraction_explained(start, end, MOTIONS) == pytest.approx(share, abs=0.1)
     assert backward_elimination.fraction_explained(
-        start, toys.fitted(replace(right, mesh_differences=rough)), MOTIONS
+        start, toys.make_model_fit(replace(right, mesh_differences=rough)), MOTIONS
     ) == pytest.approx(1.0, abs=0.1)
 
 
 def test_where_all_motions_fold_apart_more_is_no_mending():
     """Nothing is judged to be lacking then, neither before nor after."""
-    worse, wrong = (toys.evidence(SLOPES, 2, NAMES, torch.tensor([0.0, 0.0, a]).double(), 0) for a in (6.0, 1.0))
+    worse, wrong = (
+        toys.draw_linearisation(SLOPES, 2, NAMES, torch.tensor([0.0, 0.0, a]).double(), 0) for a in (6.0, 1.0)
+    )
     rough = [torch.full_like(c.value, 0.03) for c in wrong.bins]
-    start, end = (toys.fitted(replace(e, mesh_differences=rough)) for e in (wrong, worse))
+    start, end = (toys.make_model_fit(replace(e, mesh_differences=rough)) for e in (wrong, worse))
     assert not has_lack_of_fit(end, MOTIONS)
     assert backward_elimination.fraction_explained(start, end, MOTIONS) < 0
 
 
 def test_how_much_is_mended_is_counted_on_cells_that_both_fits_have():
     """What the start finds elsewhere on the cloth is wrong in the end, too, and has not come with the causes."""
-    wrong, right = (toys.evidence(SLOPES, 2, NAMES, torch.tensor([0.0, 0.0, a]).double(), 0) for a in (3.0, 0.0))
+    wrong, right = (
+        toys.draw_linearisation(SLOPES, 2, NAMES, torch.tensor([0.0, 0.0, a]).double(), 0) for a in (3.0, 0.0)
+    )
     elsewhere = torch.arange(len(wrong.bins[0].value)) % 8 == 0
     cells = [c._replace(value=torch.where(elsewhere, 0.05, c.value)) for c in right.bins]
     met = [c.select(~elsewhere) for c in wrong.bins]
     numerics = [n[~elsewhere] for n in wrong.mesh_differences]
     start, end = (
-        toys.fitted(replace(wrong, bins=met, mesh_differences=numerics)),
-        toys.fitted(replace(right, bins=cells)),
+        toys.make_model_fit(replace(wrong, bins=met, mesh_differences=numerics)),
+        toys.make_model_fit(replace(right, bins=cells)),
     )
     assert compare_misfit(measure_lack_of_fit(start, MOTIONS), measure_lack_of_fit(end, MOTIONS)) < 0
     assert backward_elimination.fraction_explained(start, end, MOTIONS) > 0.9
@@ -161,7 +169,7 @@ def test_what_only_forces_tell_is_counted_where_positions_lack_nothing():
 )
 def test_a_cause_is_not_doubted_for_what_was_hardly_less_before(monkeypatch, before, after, share):
     """Case 029 of b3f2eda: a late clock, gaining 135 in log density, left a stretched sheet lacking a little."""
-    toy = toys.fitted(toys.evidence(SLOPES, 2, NAMES, torch.tensor([0.0, 0.0, 0.0]).double(), 0))
+    toy = toys.make_model_fit(toys.draw_linearisation(SLOPES, 2, NAMES, torch.tensor([0.0, 0.0, 0.0]).double(), 0))
     told = iter([[row(m, 1e-3 * r) for m, r in zip(("stretch", "swing"), own, strict=True)] for own in (before, after)])
     monkeypatch.setattr(backward_elimination, "has_lack_of_fit", lambda *_: True)
     monkeypatch.setattr(backward_elimination, "measure_lack_of_fit", lambda *_: next(told))

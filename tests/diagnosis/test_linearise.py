@@ -11,7 +11,7 @@ from torchcloth.diagnosis.inference.linearise import linearise, linearise_hypoth
 from torchcloth.episodes.steps import list_steps, one_sided_steps
 from torchcloth.errors import InvalidInput
 
-RECORDING = sheet_episodes.episode()
+RECORDING = sheet_episodes.make_episode()
 
 
 def test_what_a_parameter_does_already_has_its_slopes(made):

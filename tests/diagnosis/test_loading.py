@@ -26,14 +26,14 @@ def made(tmp_path_factory):
     """(base and extended model files, an episode of another motion than they know)."""
     before = torch.get_default_dtype()
     torch.set_default_dtype(torch.float64)
-    folder, blank = tmp_path_factory.mktemp("models"), sheet_episodes.episode()
+    folder, blank = tmp_path_factory.mktemp("models"), sheet_episodes.make_episode()
     by = {h.name: h for h in dx.list_hypotheses(dx.build_base_model(blank), [blank])}
     base = dx.build_base_model(blank)
     extended = base.with_hypothesis(by["air.drag_n"], TRUE).with_hypothesis(by["obs.clock"], 0.0)
     dx.save_model(folder / "base.tcm", base, blank)
     covariance = torch.diag(torch.tensor([0.02, 0.5, 0.05, 0.01, 1.2, 0.03, 1e-3]).double() ** 2)
     dx.save_model(folder / "extended.tcm", extended, blank, covariance, episodes=[fingerprint(blank)])
-    seen = sheet_episodes.recorded("fast", lambda world: by["air.drag_n"].apply(world, TRUE), 3)
+    seen = sheet_episodes.record_changed_world("fast", lambda world: by["air.drag_n"].apply(world, TRUE), 3)
     yield folder, rec.read(rec.write(seen, folder / "fast")), blank
     torch.set_default_dtype(before)
 
@@ -237,7 +237,7 @@ def test_the_gain_is_confirmed_on_what_was_not_seen(made, tmp_path, capsys):
 @pytest.mark.parametrize("other", ["data sheet", "set of grasps"])
 def test_another_cloth_confirms_nothing(made, other):
     folder, _, _ = made
-    unseen = sheet_episodes.episode("lift", duration=0.4)
+    unseen = sheet_episodes.make_episode("lift", duration=0.4)
     if other == "data sheet":
         nominal = {**unseen.cloth.nominal, "membrane_stiffness": 77.0}
         unseen = replace(unseen, cloth=replace(unseen.cloth, nominal=nominal))
@@ -250,8 +250,8 @@ def test_another_cloth_confirms_nothing(made, other):
 def test_a_table_that_one_episode_has_is_in_the_scene_of_all(made):
     folder, _, _ = made
     plane = rec.Collider(np.array([0.0, 0.0, 1.004]), np.array([0.0, 0.0, 1.0]), 0.4)
-    over = replace(sheet_episodes.episode("lift", duration=0.4), colliders={"table": plane})
-    free = sheet_episodes.episode("fast", duration=0.5)
+    over = replace(sheet_episodes.make_episode("lift", duration=0.4), colliders={"table": plane})
+    free = sheet_episodes.make_episode("fast", duration=0.5)
     models = [folder / name for name in ("base.tcm", "extended.tcm")]
     one, other = (dx.confirm(*models, order).gain_by_motion["lift"] for order in ([free, over], [over, free]))
     assert one.rms_after == pytest.approx(other.rms_after, rel=1e-9)

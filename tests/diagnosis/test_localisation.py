@@ -12,20 +12,20 @@ from torchcloth.diagnosis.unknown.localisation import localise_cause
 
 PART, WINDOW, EPISODE, BUMP, AMPLITUDE = 5, 3, 2, 2e-3, 1.5
 PLACE = torch.tensor([(PART // 4) * 0.075, (PART % 4) * 0.075], dtype=torch.float64)
-EPISODES = [SimpleNamespace(wrenches={f"hand {k}": None for k in range(toys.PATCHES)})] * toys.EPISODES
+EPISODES = [SimpleNamespace(wrenches={f"hand {k}": None for k in range(toys.PATCH_COUNT)})] * toys.EPISODE_COUNT
 
 
 def with_cause(change=lambda cells: cells):
     """A fit in which a cause does what the first parameter does, ten times as much as that, and one bump."""
-    cells = toys.grid()
+    cells = toys.make_cells()
     here = (cells.channel == 3 * PART) & (cells.window == WINDOW)
-    slopes = toys.smooth(0, 2)
+    slopes = toys.draw_jacobian(0, 2)
     slopes = torch.stack([slopes[..., 0], 10 * slopes[..., 0], slopes[..., 1]], -1)
     slopes[EPISODE, here, 1] += BUMP
-    found = toys.fitted(toys.evidence(slopes, 2, [], torch.zeros(2).double(), 0), std=100.0)
+    found = toys.make_model_fit(toys.draw_linearisation(slopes, 2, [], torch.zeros(2).double(), 0), std=100.0)
     evidence = replace(found.linearisation, bins=[change(c) for c in found.linearisation.bins])
     model = replace(found.model, parameters=found.model.parameters[:1], coordinates=found.model.coordinates[:1])
-    model = model.with_hypothesis(toys.hypothesis("cause", 1.0), AMPLITUDE)
+    model = model.with_hypothesis(toys.make_hypothesis("cause", 1.0), AMPLITUDE)
     return replace(found, linearisation=evidence, model=model)
 
 

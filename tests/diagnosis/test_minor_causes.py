@@ -25,7 +25,7 @@ HEM = ("mass.hem", 0.02, 0.39 * RELEVANT_FRACTION * 0.02)
 
 
 def candidate(name, typical, amplitude, **options):
-    return SimpleNamespace(hypothesis=toys.hypothesis(name, typical, **options), amplitude=amplitude, score=None)
+    return SimpleNamespace(hypothesis=toys.make_hypothesis(name, typical, **options), amplitude=amplitude, score=None)
 
 
 def ended(best, *rivals):
@@ -69,7 +69,7 @@ def test_what_slopes_cannot_tell_from_a_cause_might_have_to_matter_too(monkeypat
     What is the same by structure has no size of its own.
     """
     found = ended(("contact.aniso", -0.5, 0.41), EXTRINSIC)
-    (step,), mu = found.accepted, toys.hypothesis("contact.mu", 0.2)
+    (step,), mu = found.accepted, toys.make_hypothesis("contact.mu", 0.2)
     step.candidate.hypothesis = replace(step.candidate.hypothesis, structurally_equivalent=kin)
     like = SimpleNamespace(hypothesis=mu, amplitude=asked, chi2=1.0)
     monkeypatch.setattr(search, "find_confounded", lambda before, row, amplitude, others: others)
@@ -155,7 +155,7 @@ def test_what_was_brought_along_takes_the_place_of_what_brought_it(monkeypatch, 
     """Where hardly any wind is left, and the drag alone predicts about as well and better than its placebos."""
     drag, wind = candidate("air.drag_n", 1.2, 1.4), candidate("air.wind[y]", 0.3, 0.2, implies="air.drag_n")
     drag.fit, drag.sole_informative_motion = None, set()
-    camera = toys.hypothesis("obs.extrinsic[y]", 4e-3)
+    camera = toys.make_hypothesis("obs.extrinsic[y]", 4e-3)
     base = WorldModel(None, (), toys.torch.zeros(0), (camera,), (4e-3,))  # type: ignore[arg-type]
     current = SimpleNamespace(model=base.with_hypothesis(wind.hypothesis, left), linearisation=None)
     step = AcceptedCause(wind, None, [wind, drag], [drag], [], None, None)  # type: ignore[arg-type]
@@ -226,9 +226,9 @@ def score_of(is_visible: bool, decision: str = "present", expected_gain: float =
 def test_what_a_parameter_does_already_must_show_beside_its_data_sheet(twin, row, low, worth):
     """It mends nothing beside the parameter that has done it, and hardly predicts better where the sheet is far off."""
     gain = Gain(1e-3, 1e-3, 5.0, (low, 9.0), 0.0, (0.0, 0.0), (1e-3, 1e-3), (0.0, 0.0), low)
-    fitted = SimpleNamespace(model=SimpleNamespace(parameters=[toys.parameter("p")]))
+    fitted = SimpleNamespace(model=SimpleNamespace(parameters=[toys.make_parameter("p")]))
     c = SimpleNamespace(
-        hypothesis=toys.hypothesis("m", equivalent_parameter=twin), fit=fitted, score=row, prior_shift=0.0
+        hypothesis=toys.make_hypothesis("m", equivalent_parameter=twin), fit=fitted, score=row, prior_shift=0.0
     )
     assert candidates.is_improvement(c, gain) == worth  # type: ignore[arg-type]
     assert not candidates.is_worthwhile(gain)

@@ -17,7 +17,7 @@ STRETCH = 0.15  # s
 
 
 def quarter(uv):
-    return (uv < 0.5 * sheet_episodes.SIDE).all(1)
+    return (uv < 0.5 * sheet_episodes.SIDE_M).all(1)
 
 
 def pushed_for_a_while(world, episode):
@@ -51,8 +51,8 @@ def planted():
     torch.set_default_dtype(torch.float64)
     still = lambda world: world  # noqa: E731
     recordings = [
-        sheet_episodes.recorded("slow", still, 0, pushed_for_a_while),
-        sheet_episodes.recorded("fast", still, 1),
+        sheet_episodes.record_changed_world("slow", still, 0, pushed_for_a_while),
+        sheet_episodes.record_changed_world("fast", still, 1),
     ]
     yield fitted(recordings)
     torch.set_default_dtype(before)
@@ -63,18 +63,18 @@ def test_it_is_found_there_and_then(planted):
     answer = estimate_missing_force(found, setting, window=STRETCH)
     there, elsewhere = answer.motions
     window, vertex = there.strongest
-    begin, end = BEGIN / sheet_episodes.RATE, END / sheet_episodes.RATE
+    begin, end = BEGIN / sheet_episodes.FRAME_RATE_HZ, END / sheet_episodes.FRAME_RATE_HZ
     assert float(there.windows[window].mean()) == pytest.approx((begin + end) / 2, abs=STRETCH)
     assert bool(quarter(answer.uv)[vertex])
     force = there.force[window, vertex]
     assert float(force[1] / force.norm()) > 0.9
     assert float(there.certainty[window, vertex]) > 4
     total = answer.total(there)[window]
-    assert float(total[1]) == pytest.approx(0.2 * float(PUSH[1]) * sheet_episodes.SIDE**2 / 4, rel=0.25)
+    assert float(total[1]) == pytest.approx(0.2 * float(PUSH[1]) * sheet_episodes.SIDE_M**2 / 4, rel=0.25)
     assert float(elsewhere.certainty.max()) < 0.5 * float(there.certainty.max())
     told = answer.as_dict()["motions"]
     assert [t["is_significant"] for t in told] == [True, False]
-    assert max(told[0]["at"]) < 0.5 * sheet_episodes.SIDE
+    assert max(told[0]["at"]) < 0.5 * sheet_episodes.SIDE_M
 
 
 def test_the_fit_lacks_there_and_not_in_the_other_motion(planted):

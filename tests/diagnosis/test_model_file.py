@@ -17,7 +17,7 @@ from torchcloth.diagnosis import build_base_model, list_hypotheses, read_model, 
 from torchcloth.errors import RecordingError
 from torchcloth.identification.io.saved_fit import fingerprint
 
-RECORDING = sheet_episodes.episode(resolution=(4, 4))
+RECORDING = sheet_episodes.make_episode(resolution=(4, 4))
 
 
 @pytest.fixture(scope="module")

@@ -55,18 +55,18 @@ def test_a_motion_that_alone_tells_counts_twice_and_does_not_make_three():
 
 def test_motions_without_cells_neither_count_nor_are_left_out():
     """All of them jump: three motions of which one is silent are two."""
-    slopes = toys.smooth(2, 3)
-    ev = toys.evidence(slopes, 2, [], torch.tensor([0.3, -0.2]).double(), 0)
+    slopes = toys.draw_jacobian(2, 3)
+    ev = toys.draw_linearisation(slopes, 2, [], torch.tensor([0.3, -0.2]).double(), 0)
     silent = replace(
         ev,
         bins=[*ev.bins[:3], ev.bins[3].select(slice(0))],
         mesh_differences=[*ev.mesh_differences[:3], ev.mesh_differences[3][:0]],
     )
     three = replace(ev, bins=ev.bins[:3], nuisance_stds=ev.nuisance_stds[:3], mesh_differences=ev.mesh_differences[:3])
-    mean, std = jackknife(toys.fitted(silent), ["a", "b", "c", "d"])
-    for one, other in zip((mean, std), jackknife(toys.fitted(three), ["a", "b", "c"]), strict=True):
+    mean, std = jackknife(toys.make_model_fit(silent), ["a", "b", "c", "d"])
+    for one, other in zip((mean, std), jackknife(toys.make_model_fit(three), ["a", "b", "c"]), strict=True):
         torch.testing.assert_close(one, other)
-    assert list_observed_motions(toys.fitted(silent).whitened.episode, ["a", "b", "c", "d"]) == ["a", "b", "c"]
+    assert list_observed_motions(toys.make_model_fit(silent).whitened.episode, ["a", "b", "c", "d"]) == ["a", "b", "c"]
 
 
 def test_one_motion_agrees_with_nothing():
@@ -116,7 +116,7 @@ def test_less_is_asked_of_a_rival_than_of_a_cause():
     cells = tried.fit.linearisation.bins
     for k, c in enumerate(cells):  # each asks for a little more or less
         cells[k] = c._replace(value=c.value - (0.03, -0.03, 0.02, -0.02)[k] * c.jacobian[:, 1])
-    tried = replace(tried, fit=toys.fitted(tried.fit.linearisation), t_threshold=1e3)
+    tried = replace(tried, fit=toys.make_model_fit(tried.fit.linearisation), t_threshold=1e3)
     model = replace(tried.fit.model, accepted=(tried.hypothesis,), amplitudes=(0.3,))
     model = replace(model, parameters=model.parameters[:1], coordinates=torch.zeros(1).double())
     tried = replace(tried, fit=replace(tried.fit, model=model))
@@ -151,7 +151,7 @@ def test_halves_of_one_motion_need_not_agree_about_the_size_of_what_is_overwhelm
     for k, c in enumerate(cells):
         cells[k] = c._replace(value=c.value - (0.03, -0.03, 0.02, -0.02)[k] * c.jacobian[:, 1])
     model = tried.fit.model
-    tried = replace(tried, fit=replace(toys.fitted(tried.fit.linearisation), model=model))
+    tried = replace(tried, fit=replace(toys.make_model_fit(tried.fit.linearisation), model=model))
     assert is_agreed(tried) == named
     assert not is_agreed(replace(tried, worsens_another_motion=True))
     nothing = replace(model, amplitudes=(0.0,))
@@ -167,8 +167,8 @@ def test_what_one_motion_tells_is_not_there_where_another_becomes_less_likely():
 
 
 def test_a_motion_that_is_predicted_worse_is_found_where_it_is_not_the_one_that_tells():
-    ev = toys.evidence(toys.smooth(1, 3), 2, [], torch.tensor([0.0, 0.1]).double(), 0)
-    first = predict_held_out(toys.fitted(ev), list("abcd"))
+    ev = toys.draw_linearisation(toys.draw_jacobian(1, 3), 2, [], torch.tensor([0.0, 0.1]).double(), 0)
+    first = predict_held_out(toys.make_model_fit(ev), list("abcd"))
     larger = torch.ones(4).double().index_fill(0, torch.tensor([1]), 1.5)[first.episode]
     second = first._replace(residual=larger * first.residual, whitened=larger * first.whitened)
     (worse,) = _find_worsened_motions(first, second, list("abcd"), {"a"})
@@ -183,27 +183,30 @@ def test_motions_need_not_agree_about_a_number_that_nothing_else_has_bent_so_far
     cells = tried.fit.linearisation.bins
     for k, c in enumerate(cells):
         cells[k] = c._replace(value=c.value - (0.3, -0.3, 0.2, -0.2)[k] * c.jacobian[:, 1])
-    tried = replace(tried, fit=replace(toys.fitted(tried.fit.linearisation), model=tried.fit.model))
+    tried = replace(tried, fit=replace(toys.make_model_fit(tried.fit.linearisation), model=tried.fit.model))
     assert not is_agreed(tried)
     assert not is_agreed(replace(tried, prior_shift=4.9))
     assert is_agreed(replace(tried, prior_shift=5.1))
 
 
 def test_how_far_a_twin_has_left_its_sheet_is_in_standard_deviations_of_its_prior():
-    model = WorldModel(None, (toys.parameter("p", 0.5), toys.parameter("q", 2.0)), torch.tensor([-3.0, 5.0]))  # type: ignore[arg-type]
+    model = WorldModel(None, (toys.make_parameter("p", 0.5), toys.make_parameter("q", 2.0)), torch.tensor([-3.0, 5.0]))  # type: ignore[arg-type]
     assert _measure_prior_shift(model, "p") == 6.0
     assert _measure_prior_shift(model, "q") == 2.5
     assert _measure_prior_shift(model, "") == 0.0
 
 
 def test_as_many_tell_as_would_say_as_much():
-    slopes = toys.smooth(1, 3)
+    slopes = toys.draw_jacobian(1, 3)
     all_alike = slopes[:1].expand(4, -1, -1).clone()
     one = all_alike.clone()
     one[1:, :, 1] = 0.0
     told = [
         count_effective_motions(
-            toys.fitted(toys.evidence(own, 2, [], torch.zeros(2).double(), 0)), 1, list("abcd"), halved
+            toys.make_model_fit(toys.draw_linearisation(own, 2, [], torch.zeros(2).double(), 0)),
+            1,
+            list("abcd"),
+            halved,
         )
         for own, halved in ((all_alike, ()), (one, ()), (one, {"a"}))
     ]
@@ -214,9 +217,9 @@ def test_as_many_tell_as_would_say_as_much():
 
 def candidate(asked, numerics):
     """A cause in the model of four motions that ask for so much of it, of which numerics alone would ask for a part."""
-    ev = toys.evidence(toys.smooth(1, 3), 2, [], torch.tensor([0.0, asked]).double(), 0)
-    there = toys.fitted(ev)
-    cause = replace(toys.hypothesis("cause"), signed=False)
+    ev = toys.draw_linearisation(toys.draw_jacobian(1, 3), 2, [], torch.tensor([0.0, asked]).double(), 0)
+    there = toys.make_model_fit(ev)
+    cause = replace(toys.make_hypothesis("cause"), signed=False)
     model = WorldModel(None, there.model.parameters[:1], torch.zeros(1).double(), (cause,), (0.3,))  # type: ignore[arg-type]
     row = ScoreTest(cause, asked, 0.01, numerics, 0.0, 0.0, 0.0, asked, 0.0, "present")
     return Candidate(row, replace(there, model=model), None, None, set(), 2.57)  # type: ignore[arg-type]
@@ -224,10 +227,10 @@ def candidate(asked, numerics):
 
 def test_a_numbers_interval_knows_of_what_motions_disagree_by():
     """Each of four motions has a value of its own: one interval holds what noise allows, the other what they say."""
-    ev = toys.evidence(toys.smooth(1, 3), 2, [], torch.zeros(2).double(), 0)
+    ev = toys.draw_linearisation(toys.draw_jacobian(1, 3), 2, [], torch.zeros(2).double(), 0)
     own = (0.3, -0.3, 0.2, -0.2)
     cells = [c._replace(value=c.value - a * c.jacobian[:, 1]) for c, a in zip(ev.bins, own, strict=True)]
-    found = toys.fitted(replace(ev, bins=cells))
+    found = toys.make_model_fit(replace(ev, bins=cells))
     width = {
         name: (row["ci95"][1] - row["ci95"][0]) / 3.92
         for name, row in _describe_parameters(SimpleNamespace(end=found), list("abcd")).items()  # type: ignore[arg-type]
@@ -245,26 +248,29 @@ def test_a_numbers_interval_knows_of_what_motions_disagree_by():
 )
 def test_motions_that_differ_by_more_than_noise_disagree(own, told, disagree):
     """Where hardly two of them tell of a number, nothing is known of what others would say."""
-    ev = toys.evidence(toys.smooth(1, 3), 2, [], torch.zeros(2).double(), 1)
+    ev = toys.draw_linearisation(toys.draw_jacobian(1, 3), 2, [], torch.zeros(2).double(), 1)
     cells = [c._replace(value=c.value - a * c.jacobian[:, 1]) for c, a in zip(ev.bins, own, strict=True)]
-    found = SimpleNamespace(end=toys.fitted(replace(ev, bins=cells)))
+    found = SimpleNamespace(end=toys.make_model_fit(replace(ev, bins=cells)))
     assert _do_motions_disagree(found, 1, told, list("abcd")) == disagree  # type: ignore[arg-type]
 
 
 def test_motions_of_one_value_disagree_as_often_as_chance_has_it():
-    slopes, count = toys.smooth(1, 3), 300
-    found = [toys.fitted(toys.evidence(slopes, 2, [], torch.zeros(2).double(), seed)) for seed in range(count)]
+    slopes, count = toys.draw_jacobian(1, 3), 300
+    found = [
+        toys.make_model_fit(toys.draw_linearisation(slopes, 2, [], torch.zeros(2).double(), seed))
+        for seed in range(count)
+    ]
     told = count_effective_motions(found[0], 1, list("abcd"))
     often = sum(_do_motions_disagree(SimpleNamespace(end=f), 1, told, list("abcd")) for f in found)  # type: ignore[arg-type]
     assert often <= 0.02 * count
 
 
 def test_an_error_is_the_noises_where_motions_agree_and_says_how_many_tell():
-    ev = toys.evidence(toys.smooth(1, 3), 2, [], torch.zeros(2).double(), 0)
+    ev = toys.draw_linearisation(toys.draw_jacobian(1, 3), 2, [], torch.zeros(2).double(), 0)
     share = (1.0, 1.0, 0.0, 0.0)  # two of four motions tell of the second number, all of the first
     scale = lambda c, s: torch.stack([c.jacobian[:, 0], s * c.jacobian[:, 1]], 1)  # noqa: E731
     cells = [c._replace(jacobian=scale(c, s), value=0 * c.value) for c, s in zip(ev.bins, share, strict=True)]
-    found = toys.fitted(replace(ev, bins=cells))
+    found = toys.make_model_fit(replace(ev, bins=cells))
     noise = found.covariance.diagonal().sqrt()
     for place, few in ((0, False), (1, True)):
         own, both, told = _amplitude_errors(SimpleNamespace(end=found), place, list("abcd"), ())  # type: ignore[arg-type]

@@ -30,11 +30,11 @@ from torchcloth.diagnosis.report.wording import _is_implausibly_large, _warn_of_
 from torchcloth.errors import InvalidInput
 
 NAMES = ["a", "b", "c"]
-SLOPES = toys.smooth(1, 6)  # two parameters, three hypotheses, one nuisance
+SLOPES = toys.draw_jacobian(1, 6)  # two parameters, three hypotheses, one nuisance
 
 
 def asked(truth, seed=0, slopes=SLOPES, **options):
-    return toys.fitted(toys.evidence(slopes, 2, NAMES, torch.tensor(truth).double(), seed), **options)
+    return toys.make_model_fit(toys.draw_linearisation(slopes, 2, NAMES, torch.tensor(truth).double(), seed), **options)
 
 
 def row(found, name):
@@ -76,11 +76,13 @@ def test_single_stretches_are_surely_no_gain():
 
 def test_without_noise_it_is_exact_and_parameters_do_not_matter():
     """r = -J_j a asks for a; what fitted parameters of any size do is not mistaken for a hypothesis."""
-    ev = toys.evidence(SLOPES, 2, NAMES, torch.zeros(5).double(), 0)
+    ev = toys.draw_linearisation(SLOPES, 2, NAMES, torch.zeros(5).double(), 0)
     for shift in (0.0, 0.3):
         truth = torch.tensor([shift, -shift, 0.0, 0.7, 0.0]).double()
         cells = [c._replace(value=-c.jacobian[:, :5] @ truth) for c in ev.bins]
-        found = toys.fitted(ev.__class__(cells, 2, ev.hypotheses, ev.nuisance_stds, ev.mesh_differences), std=1e6)
+        found = toys.make_model_fit(
+            ev.__class__(cells, 2, ev.hypotheses, ev.nuisance_stds, ev.mesh_differences), std=1e6
+        )
         fitted_out = {r.hypothesis.name: r for r in screen(found)}
         joint = torch.linalg.lstsq(
             torch.cat([c.jacobian[:, [0, 1, 3]] for c in cells]), torch.cat([c.value for c in cells])[:, None]
@@ -92,14 +94,14 @@ def test_without_noise_it_is_exact_and_parameters_do_not_matter():
 def disagreeing(seed, by):
     """(error of the third parameter's estimate, its spread over motions, its error from noise), truth 0.7 +- ``by``."""
     rng = torch.Generator().manual_seed(seed)
-    truths = 0.7 + by * torch.randn(toys.EPISODES, generator=rng).double()
+    truths = 0.7 + by * torch.randn(toys.EPISODE_COUNT, generator=rng).double()
     none = torch.zeros(5).double()
-    ev = toys.evidence(SLOPES, 3, NAMES[:2], none, seed)
+    ev = toys.draw_linearisation(SLOPES, 3, NAMES[:2], none, seed)
     cells = [c._replace(value=c.value - t * c.jacobian[:, 2]) for c, t in zip(ev.bins, truths, strict=True)]
-    found = toys.fitted(ev.__class__(cells, 3, ev.hypotheses, ev.nuisance_stds, ev.mesh_differences), std=1e6)
+    found = toys.make_model_fit(ev.__class__(cells, 3, ev.hypotheses, ev.nuisance_stds, ev.mesh_differences), std=1e6)
     own, value = found.whitened.jacobian[:, :3], found.whitened.value
     estimate = -torch.linalg.lstsq(own, value[:, None]).solution[2, 0]
-    motions = [str(k) for k in range(toys.EPISODES)]
+    motions = [str(k) for k in range(toys.EPISODE_COUNT)]
     return float(estimate) - 0.7, float(jackknife(found, motions)[1][2]), float(found.covariance[2, 2].sqrt())
 
 
@@ -124,22 +126,25 @@ def test_scores_do_not_depend_on_how_parameters_are_written():
 
 def test_a_nuisance_of_one_episode_is_no_cause():
     """Three standard deviations of every episode's own nuisance leave all hypotheses below notice."""
-    ev = toys.evidence(SLOPES, 2, NAMES, torch.zeros(5).double(), 5)
-    cells = [c._replace(value=c.value + 3 * toys.STD * c.jacobian[:, -1] * (-1) ** k) for k, c in enumerate(ev.bins)]
-    rows = screen(toys.fitted(ev.__class__(cells, 2, ev.hypotheses, ev.nuisance_stds, ev.mesh_differences)))
+    ev = toys.draw_linearisation(SLOPES, 2, NAMES, torch.zeros(5).double(), 5)
+    cells = [
+        c._replace(value=c.value + 3 * toys.NUISANCE_STD_M * c.jacobian[:, -1] * (-1) ** k)
+        for k, c in enumerate(ev.bins)
+    ]
+    rows = screen(toys.make_model_fit(ev.__class__(cells, 2, ev.hypotheses, ev.nuisance_stds, ev.mesh_differences)))
     assert max(abs(r.amplitude) / r.std for r in rows) < 4
     assert not any(r.decision == "present" for r in rows)
 
 
 def test_the_level_of_slow_errors_is_found_also_beside_a_strong_effect():
     for truth in ([0.0] * 5, [0.0, 0.0, 0.0, 3.0, 0.0]):
-        noise = fit_noise(toys.evidence(SLOPES, 2, NAMES, torch.tensor(truth).double(), 7))
-        assert float(noise.levels[0]) == pytest.approx(toys.SLOW, rel=0.35)
+        noise = fit_noise(toys.draw_linearisation(SLOPES, 2, NAMES, torch.tensor(truth).double(), 7))
+        assert float(noise.levels[0]) == pytest.approx(toys.SLOW_ERROR_M, rel=0.35)
 
 
 def test_the_slow_error_of_depths_is_found_and_is_no_error_of_places():
     """Images 1.5 mm too far or too near, for a while each, of cloth that faces the camera here and not there."""
-    ev = toys.evidence(SLOPES, 2, NAMES, torch.zeros(5).double(), 7)
+    ev = toys.draw_linearisation(SLOPES, 2, NAMES, torch.zeros(5).double(), 7)
     rng, size, cells = torch.Generator().manual_seed(3), 1.5e-3, []
     for c in ev.bins:
         times = c.time.unique()
@@ -149,14 +154,14 @@ def test_the_slow_error_of_depths_is_found_and_is_no_error_of_places():
         cells.append(c._replace(depth_slope=ray, value=c.value + ray * off))
     noise = fit_noise(replace(ev, bins=cells))
     assert noise.depth_level == pytest.approx(size, rel=0.4)
-    assert float(noise.levels[0]) == pytest.approx(toys.SLOW, rel=0.35)
+    assert float(noise.levels[0]) == pytest.approx(toys.SLOW_ERROR_M, rel=0.35)
     unaware = fit_noise(replace(ev, bins=[c._replace(depth_slope=torch.zeros_like(c.depth_slope)) for c in cells]))
     assert unaware.depth_level == 0, "nothing is known of a camera"
     assert float(unaware.levels[0]) > 1.3 * float(noise.levels[0])
 
 
 def test_whitened_noise_is_white():
-    ev = toys.evidence(SLOPES, 2, NAMES, torch.zeros(5).double(), 11)
+    ev = toys.draw_linearisation(SLOPES, 2, NAMES, torch.zeros(5).double(), 11)
     white = whiten(ev, fit_noise(ev)).value
     assert float(white.square().mean()) == pytest.approx(1.0, rel=0.2)
     assert abs(float((white[1:] * white[:-1]).mean())) < 4 / len(white) ** 0.5
@@ -184,25 +189,25 @@ def test_what_is_too_large_to_be_believed_is_said():
 @pytest.mark.parametrize("share", [-0.3, 0.3])
 def test_what_a_further_mesh_has_more_or_less_of_is_no_cause(share):
     """The truth lies a third of the way to the coarser mesh, or beyond the finer: that looks like a hypothesis."""
-    ev = toys.evidence(SLOPES, 2, NAMES, torch.zeros(5).double(), 0)
+    ev = toys.draw_linearisation(SLOPES, 2, NAMES, torch.zeros(5).double(), 0)
     generator = torch.Generator().manual_seed(3)
     numerics = []
     for c in ev.bins:  # mostly what "b" does, and something of its own
         own = torch.randn(len(c.value), generator=generator).double() * c.jacobian[:, 3].std()
         numerics.append(3.0 * (c.jacobian[:, 3] + 0.3 * own))
     cells = [c._replace(value=c.value + share * n) for c, n in zip(ev.bins, numerics, strict=True)]
-    blind = row(toys.fitted(ev.__class__(cells, 2, ev.hypotheses, ev.nuisance_stds, ev.mesh_differences)), "b")
-    aware = row(toys.fitted(ev.__class__(cells, 2, ev.hypotheses, ev.nuisance_stds, numerics)), "b")
+    blind = row(toys.make_model_fit(ev.__class__(cells, 2, ev.hypotheses, ev.nuisance_stds, ev.mesh_differences)), "b")
+    aware = row(toys.make_model_fit(ev.__class__(cells, 2, ev.hypotheses, ev.nuisance_stds, numerics)), "b")
     assert abs(blind.amplitude) > 10 * blind.std
     assert abs(aware.amplitude) < 2.5 * aware.std
-    assert aware.std < 2 * abs(share) * 3.0 / toys.EPISODES**0.5  # episodes have their own share each
+    assert aware.std < 2 * abs(share) * 3.0 / toys.EPISODE_COUNT**0.5  # episodes have their own share each
 
 
 def test_numerics_widen_the_error():
-    ev = toys.evidence(SLOPES, 2, NAMES, torch.tensor([0.0, 0.0, 0.0, 0.6, 0.0]).double(), 2)
+    ev = toys.draw_linearisation(SLOPES, 2, NAMES, torch.tensor([0.0, 0.0, 0.0, 0.6, 0.0]).double(), 2)
     shifted = [-3 * 0.5 * c.jacobian[:, 3] for c in ev.bins]  # the coarser mesh errs like b at 1.5
-    plain = row(toys.fitted(ev), "b")
-    wide = row(toys.fitted(ev.__class__(ev.bins, 2, ev.hypotheses, ev.nuisance_stds, shifted)), "b")
+    plain = row(toys.make_model_fit(ev), "b")
+    wide = row(toys.make_model_fit(ev.__class__(ev.bins, 2, ev.hypotheses, ev.nuisance_stds, shifted)), "b")
     assert wide.mesh_bias == pytest.approx(0.5, rel=0.1)
     assert plain.decision == "present"
     assert wide.decision != "present"
@@ -210,12 +215,12 @@ def test_numerics_widen_the_error():
 
 def test_what_a_fitted_parameter_does_as_well_is_known_by_its_prior_alone():
     found = asked([0.0, 0.0, 0.7, 0.0, 0.0])
-    hypotheses = [toys.hypothesis("a", equivalent_parameter="p1"), *found.linearisation.hypotheses[1:]]
+    hypotheses = [toys.make_hypothesis("a", equivalent_parameter="p1"), *found.linearisation.hypotheses[1:]]
     found = replace(found, linearisation=replace(found.linearisation, hypotheses=hypotheses))
     assert row(found, "a").decision == "unresolvable"
     far = replace(found, model=found.model.at_point(torch.tensor([0.0, 4 * 0.5]).double()))
     stranger = replace(
-        far, linearisation=replace(far.linearisation, hypotheses=[toys.hypothesis("a"), *hypotheses[1:]])
+        far, linearisation=replace(far.linearisation, hypotheses=[toys.make_hypothesis("a"), *hypotheses[1:]])
     )
     apart = ("hypothesis", "position_rms")
     alike = [{k: v for k, v in row(f, "a")._asdict().items() if k not in apart} for f in (far, stranger)]
@@ -227,7 +232,7 @@ def test_beside_a_parameter_that_its_prior_holds_its_twin_asks_for_what_both_wou
     same = SLOPES.clone()
     same[..., 2] = same[..., 1]
     found = asked([0.0, 0.0, 0.7, 0.0, 0.0], slopes=same, std=0.05)
-    twins = [toys.hypothesis("a", equivalent_parameter="p1"), *found.linearisation.hypotheses[1:]]
+    twins = [toys.make_hypothesis("a", equivalent_parameter="p1"), *found.linearisation.hypotheses[1:]]
     found = replace(found, linearisation=replace(found.linearisation, hypotheses=twins))
     step, _ = gauss_newton_step(found.whitened, found.model)
     cells = [c._replace(value=c.value + c.jacobian[:, :2] @ step) for c in found.linearisation.bins]
@@ -246,10 +251,10 @@ def test_beside_a_parameter_that_its_prior_holds_its_twin_asks_for_what_both_wou
 
 
 def test_what_is_rough_is_noise_of_its_stretch():
-    ev = toys.evidence(SLOPES, 2, ["a", "b", "c"], torch.zeros(5).double(), 0)
+    ev = toys.draw_linearisation(SLOPES, 2, ["a", "b", "c"], torch.zeros(5).double(), 0)
     rough = 3e-3 * (ev.bins[0].window == 2)
     cells = [ev.bins[0]._replace(roughness=rough), *ev.bins[1:]]
-    level = torch.full((len(KINDS),), toys.SLOW).double()
+    level = torch.full((len(KINDS),), toys.SLOW_ERROR_M).double()
     none = torch.zeros(len(rough), 0).double()
     plain, wide = (Noise(level).covariance(c[0], none, none[0]) for c in (ev.bins, cells))
     more = (wide - plain).diagonal()
@@ -292,7 +297,7 @@ def test_what_a_fit_finds_tells_it_from_strangers_though_a_score_found_little():
 
 def test_more_scatter_within_cells_is_no_gain():
     """Of two models that leave the same residuals neither is the likelier, however their points scatter."""
-    ev = toys.evidence(SLOPES, 2, NAMES, torch.zeros(5).double(), 3)
+    ev = toys.draw_linearisation(SLOPES, 2, NAMES, torch.zeros(5).double(), 3)
     cells = [
         c._replace(
             row_std=1.1 * c.row_std,
@@ -304,7 +309,7 @@ def test_more_scatter_within_cells_is_no_gain():
         )
         for c in ev.bins
     ]
-    groups, one, other = ["x", "y", "x", "y"], toys.fitted(ev), toys.fitted(replace(ev, bins=cells))
+    groups, one, other = ["x", "y", "x", "y"], toys.make_model_fit(ev), toys.make_model_fit(replace(ev, bins=cells))
     like = [reweight_by_noise(found, one.noise, one.linearisation) for found in (one, other)]
     first, same, more = (
         predict_held_out(found, groups) for found in (*like, reweight_by_noise(other, one.noise, other.linearisation))
@@ -315,7 +320,7 @@ def test_more_scatter_within_cells_is_no_gain():
 
 def test_models_that_meet_other_cells_are_compared_on_those_that_both_meet():
     """The same residuals are no gain, whichever of the two has met fewer of them."""
-    ev = toys.evidence(SLOPES, 2, NAMES, torch.zeros(5).double(), 3)
+    ev = toys.draw_linearisation(SLOPES, 2, NAMES, torch.zeros(5).double(), 3)
     rough = replace(ev, bins=[c._replace(roughness=1e-3 * torch.rand(len(c.value))) for c in ev.bins])
     fewer = [c.select(slice(5, None)) for c in rough.bins]
     less = replace(
@@ -326,14 +331,18 @@ def test_models_that_meet_other_cells_are_compared_on_those_that_both_meet():
     for own, taken in zip(ev.bins, use_noise_inputs(ev, less).bins, strict=True):
         assert torch.equal(taken.key, own.key[5:])
         assert torch.equal(taken.row_std, 2 * own.row_std[5:])
-    groups, one, other = ["x", "y", "x", "y"], toys.fitted(rough), toys.fitted(replace(less, bins=fewer))
+    groups, one, other = (
+        ["x", "y", "x", "y"],
+        toys.make_model_fit(rough),
+        toys.make_model_fit(replace(less, bins=fewer)),
+    )
     for both in ((one, other), (other, one)):
         first, second = (predict_held_out(found, groups) for found in put_on_common_noise(*both))
         assert compare(first, second, 1e-3).log_density == pytest.approx(0.0, abs=1e-9)
 
 
 def test_an_episode_without_a_cell_says_nothing():
-    ev = toys.evidence(SLOPES, 2, NAMES, torch.zeros(5).double(), 3)
+    ev = toys.draw_linearisation(SLOPES, 2, NAMES, torch.zeros(5).double(), 3)
     none = ev.bins[0].select(slice(0))
     empty = replace(
         ev, bins=[none, *ev.bins[1:]], mesh_differences=[ev.mesh_differences[0][:0], *ev.mesh_differences[1:]]
@@ -345,7 +354,7 @@ def test_an_episode_without_a_cell_says_nothing():
     alike = use_noise_inputs(ev, empty)
     assert [len(c.value) for c in alike.bins] == [0, *(len(c.value) for c in ev.bins[1:])]
     assert torch.isfinite(whiten(alike, noise).value).all()
-    blind = toys.fitted(empty)
+    blind = toys.make_model_fit(empty)
     first = select_episodes(predict_held_out(blind, list("wxyz")), [0])
     gain = compare(first, first, 1e-3)  # of a motion alone
     assert math.isnan(gain.rms_before)
@@ -358,14 +367,14 @@ def test_an_episode_without_a_cell_says_nothing():
 def test_a_true_cause_predicts_motions_that_were_held_out():
     """The gain is what the effect did; a model without it predicts them no better than itself."""
     truth = torch.tensor([0.2, 0.0, 0.0, 1.0, 0.0]).double()
-    ev = toys.evidence(SLOPES, 2, NAMES, truth, 4)
+    ev = toys.draw_linearisation(SLOPES, 2, NAMES, truth, 4)
     groups = ["x", "y", "x", "y"]
-    without = predict_held_out(toys.fitted(ev), groups)
+    without = predict_held_out(toys.make_model_fit(ev), groups)
     order = [0, 1, 3, 2, 4, 5]  # b joins what is fitted
     cells = [c._replace(jacobian=c.jacobian[:, order]) for c in ev.bins]
     with_b = ev.__class__(cells, 3, [ev.hypotheses[0], ev.hypotheses[2]], ev.nuisance_stds, ev.mesh_differences)
-    after = predict_held_out(toys.fitted(with_b, std=2.0), groups)
-    floor = compute_noise_floor(ev, toys.fitted(ev).noise)
+    after = predict_held_out(toys.make_model_fit(with_b, std=2.0), groups)
+    floor = compute_noise_floor(ev, toys.make_model_fit(ev).noise)
     gain = compare(without, after, floor)
     assert gain.log_density_ci95[0] > 0
     assert gain.rms_after < 0.6 * gain.rms_before
@@ -383,12 +392,14 @@ def test_a_wrong_cause_does_not_predict_them():
     """With nothing to explain, one more number predicts worse, if anything."""
     gains = []
     for seed in range(12):
-        ev = toys.evidence(SLOPES, 2, NAMES, torch.zeros(5).double(), 50 + seed)
+        ev = toys.draw_linearisation(SLOPES, 2, NAMES, torch.zeros(5).double(), 50 + seed)
         more = ev.__class__(ev.bins, 3, ev.hypotheses[1:], ev.nuisance_stds, ev.mesh_differences)
         groups = ["x", "y", "x", "y"]
         gains.append(
             compare(
-                predict_held_out(toys.fitted(ev), groups), predict_held_out(toys.fitted(more), groups), 1e-3
+                predict_held_out(toys.make_model_fit(ev), groups),
+                predict_held_out(toys.make_model_fit(more), groups),
+                1e-3,
             ).log_density_ci95[0]
             > 0
         )
@@ -410,7 +421,7 @@ def test_what_shows_in_one_episode_shows_however_many_others_there_are():
 )
 def test_what_a_leap_makes_large_is_not_ruled_out_by_slopes(reached, worth, said):
     """Large effects bend the fit until slopes there ask for less than there is."""
-    asks = ScoreTest(toys.hypothesis("a"), 0.2, 0.01, 0.0, 400.0, 1e-2, 0.0, reached, worth, "absent")
+    asks = ScoreTest(toys.make_hypothesis("a"), 0.2, 0.01, 0.0, 400.0, 1e-2, 0.0, reached, worth, "absent")
     assert _decide(asks) == said
 
 
@@ -419,7 +430,7 @@ def test_what_a_leap_makes_large_is_not_ruled_out_by_slopes(reached, worth, said
     [(-0.5, False, "absent", True), (-0.5, True, "present", False), (-0.3, False, "absent", False)],
 )
 def test_what_would_matter_but_for_its_sign_is_no_trifle(amplitude, signed, decision, wrong):
-    h = replace(toys.hypothesis("a"), signed=signed)
+    h = replace(toys.make_hypothesis("a"), signed=signed)
     assert ScoreTest(h, amplitude, 0.01, 0.0, 400.0, 1e-2, 0.0, amplitude, 20.0, decision).has_wrong_sign == wrong
 
 
@@ -466,11 +477,11 @@ def test_a_single_stretch_of_time_confirms_nothing():
 
 
 def test_what_is_surely_there_is_present_though_a_usual_amount_of_it_could_not_be_seen():
-    ev = toys.evidence(toys.smooth(5, 4), 2, ["X"], torch.tensor([0.0, 0.0, 0.3]), 0)
+    ev = toys.draw_linearisation(toys.draw_jacobian(5, 4), 2, ["X"], torch.tensor([0.0, 0.0, 0.3]), 0)
     small = replace(ev, hypotheses=[replace(ev.hypotheses[0], typical=0.06)])
-    (row,) = screen(toys.fitted(small))
+    (row,) = screen(toys.make_model_fit(small))
     assert row.visibility < 1 < row.visibility * row.amplitude / 0.06
     assert row.decision == "present"
-    less = toys.evidence(toys.smooth(5, 4), 2, ["X"], torch.tensor([0.0, 0.0, 0.03]), 0)
-    (row,) = screen(toys.fitted(replace(less, hypotheses=small.hypotheses)))
+    less = toys.draw_linearisation(toys.draw_jacobian(5, 4), 2, ["X"], torch.tensor([0.0, 0.0, 0.03]), 0)
+    (row,) = screen(toys.make_model_fit(replace(less, hypotheses=small.hypotheses)))
     assert row.decision == "unresolvable"

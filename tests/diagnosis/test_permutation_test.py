@@ -9,16 +9,16 @@ from torchcloth.diagnosis.inference.fitting import robust_step
 from torchcloth.diagnosis.inference.permutation_test import run_permutation_test
 from torchcloth.diagnosis.inference.robust_weights import reweight
 
-SLOPES = toys.smooth(1, 4)  # two parameters, a cause, a nuisance
-MOTIONS = [f"motion {k}" for k in range(toys.EPISODES)]
+SLOPES = toys.draw_jacobian(1, 4)  # two parameters, a cause, a nuisance
+MOTIONS = [f"motion {k}" for k in range(toys.EPISODE_COUNT)]
 
 
 def with_cause(amplitude: float, seed: int, slopes=SLOPES):
     """A fitted model with the cause, of data that have so much of it."""
-    ev = toys.evidence(slopes, 3, [], torch.tensor([0.1, -0.1, amplitude]).double(), seed)
-    found = toys.fitted(ev)
+    ev = toys.draw_linearisation(slopes, 3, [], torch.tensor([0.1, -0.1, amplitude]).double(), seed)
+    found = toys.make_model_fit(ev)
     model = replace(found.model, parameters=found.model.parameters[:2], coordinates=found.model.coordinates[:2])
-    model = model.with_hypothesis(toys.hypothesis("cause"))
+    model = model.with_hypothesis(toys.make_hypothesis("cause"))
     step, _ = robust_step(found.whitened, model)
     there = found.whitened._replace(value=found.whitened.value + found.whitened.jacobian[:, :3] @ step)
     return replace(found, model=model.at_point(step), whitened=reweight(there))
@@ -47,8 +47,8 @@ def test_what_is_alike_everywhere_is_no_placebo_of_itself():
     for share in (0.0, 0.03):  # by which windows differ
         rng = torch.Generator().manual_seed(5)
         steady = SLOPES.clone()
-        windows = 1 - share * torch.rand(toys.EPISODES, toys.WINDOWS, generator=rng).double()
-        steady[..., 2] = 4e-3 * windows[:, toys.grid().window]
+        windows = 1 - share * torch.rand(toys.EPISODE_COUNT, toys.WINDOW_COUNT, generator=rng).double()
+        steady[..., 2] = 4e-3 * windows[:, toys.make_cells().window]
         assert all(
             run_permutation_test(with_cause(1.0, seed, steady), MOTIONS, seed=seed).is_passed for seed in range(6)
         )

@@ -20,10 +20,12 @@ def gathered():
     """(evidence, setting) of an episode whose points lie on a surface that wind has moved."""
     before = torch.get_default_dtype()
     torch.set_default_dtype(torch.float64)
-    blank = sheet_episodes.episode()
+    blank = sheet_episodes.make_episode()
     wind = next(h for h in dx.list_hypotheses(dx.build_base_model(blank), [blank]) if h.name == "air.wind[y]")
     model = dx.build_base_model(blank)
-    setting = dx.prepare_data(model, [sheet_episodes.recorded("slow", lambda world: wind.apply(world, 0.5), 3)])
+    setting = dx.prepare_data(
+        model, [sheet_episodes.record_changed_world("slow", lambda world: wind.apply(world, 0.5), 3)]
+    )
     yield dx.linearise(model, setting), setting
     torch.set_default_dtype(before)
 

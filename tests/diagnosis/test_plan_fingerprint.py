@@ -12,7 +12,7 @@ NAMES = ["swing", "hang"]
 
 
 def decided():
-    recording = sheet_episodes.episode()
+    recording = sheet_episodes.make_episode()
     model = build_base_model(recording)
     return recording, model, list_hypotheses(model, [recording])
 

@@ -16,12 +16,14 @@ from torchcloth.diagnosis.inference.prior_restarts import refit_from_prior
 from torchcloth.episodes.world import STRAINED_PRIOR_STDS
 from torchcloth.errors import SimulationDiverged
 
-CAUSE = toys.hypothesis("cause", 2.0)
+CAUSE = toys.make_hypothesis("cause", 2.0)
 
 
 def found(far: float):
     """A fit with one cause whose first number is ``far`` prior standard deviations from its data sheet."""
-    there = toys.fitted(toys.evidence(toys.smooth(1, 2), 1, [], torch.tensor([0.4]).double(), 0), std=0.5)
+    there = toys.make_model_fit(
+        toys.draw_linearisation(toys.draw_jacobian(1, 2), 1, [], torch.tensor([0.4]).double(), 0), std=0.5
+    )
     model = there.model.with_hypothesis(CAUSE, 1.5).at_point(torch.tensor([0.5 * far, 1.5]).double())
     return replace(there, model=model)
 
@@ -191,7 +193,7 @@ def test_where_nothing_is_lacking_a_cause_from_the_data_sheet_must_surely_gain(
 @pytest.mark.parametrize(("least", "tried"), [(0.0, ["much", "half"]), (5.0, ["much"]), (20.0, [])])
 def test_little_is_not_tried_from_the_data_sheet(monkeypatch, least, tried):
     promised = [(10.0, "much", None), (5.0, "half", None), (1.0, "little", None)]
-    causes = [toys.hypothesis(name, 2.0) for _, name, _ in promised]
+    causes = [toys.make_hypothesis(name, 2.0) for _, name, _ in promised]
     monkeypatch.setattr(prior_restarts, "linearise", lambda *_: found(0.0).linearisation)
     monkeypatch.setattr(prior_restarts, "linearise_hypotheses", lambda here, *_: here)
     monkeypatch.setattr(prior_restarts, "_expected_gains", lambda _: promised)
@@ -272,8 +274,10 @@ def test_what_a_model_has_is_not_asked_about_again(monkeypatch):
 
     monkeypatch.setattr(search, "quadratic_warm_start", lambda model, *_: (model, None))
     monkeypatch.setattr(search, "fit", base_fit)
-    model = toys.fitted(toys.evidence(toys.smooth(1, 2), 1, [], torch.tensor([0.4]).double(), 0)).model
-    other = toys.hypothesis("another")
+    model = toys.make_model_fit(
+        toys.draw_linearisation(toys.draw_jacobian(1, 2), 1, [], torch.tensor([0.4]).double(), 0)
+    ).model
+    other = toys.make_hypothesis("another")
     with pytest.raises(Enough):
         search.search(model.with_hypothesis(CAUSE, 1.0), None, [CAUSE, other])  # type: ignore[arg-type]
     assert asked == ["another"]
@@ -294,7 +298,9 @@ class Asked:
 )
 def test_cells_that_jump_with_a_cause_are_left_out_where_nothing_else_is_lacking(monkeypatch, lacking, kept, left_out):
     """A loose grip leaves slack that buckles to either side, where vacuum has none."""
-    whole = toys.fitted(toys.evidence(toys.smooth(4, 2), 1, [], torch.tensor([0.4]).double(), 0))
+    whole = toys.make_model_fit(
+        toys.draw_linearisation(toys.draw_jacobian(4, 2), 1, [], torch.tensor([0.4]).double(), 0)
+    )
     first, second = (tuple(c.key[k : k + 1] for c in whole.linearisation.bins) for k in (0, 1))
     start = search.drop_bins(whole, first)
     best = Candidate(SimpleNamespace(hypothesis=CAUSE), start, None, None, set(), 0.0)  # type: ignore[arg-type]
@@ -314,7 +320,7 @@ def test_cells_that_jump_with_a_cause_are_left_out_where_nothing_else_is_lacking
         "_compute_total_gain",
         lambda *_: SimpleNamespace(rms_before=1.0, rms_after=0.5, explained_fraction=0.75),
     )
-    asked = Asked(["a"] * toys.EPISODES, first)
+    asked = Asked(["a"] * toys.EPISODE_COUNT, first)
     found = search._search_stepwise(start, asked, [], lambda _: None, 4, step)  # type: ignore[arg-type]
     assert found.accepted == ([step] if kept else [])
     for cells, keys, before in zip(

@@ -11,7 +11,7 @@ import pytest
 import torch
 from helpers import linear_evidence as toys
 from helpers import sheet_episodes
-from helpers.undecided_search import undecided
+from helpers.undecided_search import make_undecided_search
 
 from torchcloth.diagnosis import build_base_model, prepare_data
 from torchcloth.diagnosis.data.dataset import extend_for_clock
@@ -53,7 +53,7 @@ print(json.dumps(found))
 
 def test_the_library_is_that_of_the_independent_engine():
     """Displacements and turns of both grippers, by the other code."""
-    template = sheet_episodes.episode()
+    template = sheet_episodes.make_episode()
     own = float(np.rad2deg(measure_heading(template)))
     asked = json.dumps([[e.motion, e.heading + own, e.speed] for e in EXPERIMENTS])
     run = [sys.executable, "-c", PRINT_MOTIONS_SCRIPT, asked]
@@ -71,7 +71,7 @@ def test_the_library_is_that_of_the_independent_engine():
 
 
 def test_an_experiment_begins_as_the_episode_that_it_repeats_and_is_turned_from_there():
-    template = sheet_episodes.episode()
+    template = sheet_episodes.make_episode()
     begun = {n: np.asarray(g.position[0]) for n, g in template.grippers.items()}
     centre = np.mean(list(begun.values()), axis=0)
     for heading in (0.0, 90.0):
@@ -89,7 +89,7 @@ def test_an_experiment_begins_as_the_episode_that_it_repeats_and_is_turned_from_
 
 
 def test_cloth_that_lies_is_dragged_away_from_where_it_lies():
-    hanging = sheet_episodes.episode()
+    hanging = sheet_episodes.make_episode()
     flat = np.asarray(hanging.cloth.initial_vertices)
     own = measure_heading(hanging)
     for side in (-1.0, 1.0):
@@ -102,7 +102,7 @@ def test_cloth_that_lies_is_dragged_away_from_where_it_lies():
 
 
 def test_only_what_can_be_begun_is_asked_for():
-    hanging = [str(e) for e, _ in list_experiments([sheet_episodes.episode()])]
+    hanging = [str(e) for e, _ in list_experiments([sheet_episodes.make_episode()])]
     assert len(hanging) == sum(not MOTIONS[e.motion].lying for e in EXPERIMENTS)
     assert "swing, grippers and cloth turned by 90 degrees" in hanging
     assert list_experiments([]) == []
@@ -110,8 +110,8 @@ def test_only_what_can_be_begun_is_asked_for():
 
 def test_distances_are_those_of_two_columns():
     """What chi^2 is left of i's effect when j does its best, by least squares, beyond what engines may differ by."""
-    slopes = toys.smooth(5, 6)  # 2 own, 3 hypotheses, a nuisance
-    found = toys.fitted(toys.evidence(slopes, 2, ["a", "b", "c"], torch.zeros(5).double(), 0))
+    slopes = toys.draw_jacobian(5, 6)  # 2 own, 3 hypotheses, a nuisance
+    found = toys.make_model_fit(toys.draw_linearisation(slopes, 2, ["a", "b", "c"], torch.zeros(5).double(), 0))
     question = OpenQuestion(found, {"c": 0.7, "a": 0.4}, (("c", "a"),))
     told = compute_chi2(question, compute_information(question, []))[("c", "a")]
     white, prior = found.whitened.jacobian, 2.0 * torch.eye(2).double()
@@ -147,7 +147,7 @@ def test_gravity_and_camera_are_told_apart_by_turning(said, monkeypatch):
 
     Its edge is along y here, where it hangs with a lean along y edgewise.
     """
-    found, content, setting = undecided(("env.gravity_tilt[y]", "obs.rotation[x]"), said)
+    found, content, setting = make_undecided_search(("env.gravity_tilt[y]", "obs.rotation[x]"), said)
     question = find_open_question(found, content)
     now = compute_chi2(question, compute_information(question, []))
     told = {}
@@ -166,15 +166,22 @@ def test_gravity_and_camera_are_told_apart_by_turning(said, monkeypatch):
 
 
 def test_nothing_open_asks_for_nothing():
-    end = toys.fitted(toys.evidence(toys.smooth(5, 4), 1, ["a", "b"], torch.zeros(3).double(), 0))
+    end = toys.make_model_fit(
+        toys.draw_linearisation(toys.draw_jacobian(5, 4), 1, ["a", "b"], torch.zeros(3).double(), 0)
+    )
     found, none = SimpleNamespace(causes=[], minor=[], scores=[], end=end), {"causes": [], "minor": []}
     assert propose_experiment(found, none, SimpleNamespace(recordings=()), print) is None
 
 
 def test_what_does_the_same_as_a_fitted_number_is_not_waited_for():
     """No motion tells a density from the fabric's own; its data sheet alone does."""
-    end = toys.fitted(toys.evidence(toys.smooth(5, 4), 1, ["a", "b"], torch.zeros(3).double(), 0))
-    twin, other = replace(toys.hypothesis("a"), equivalent_parameter=end.model.parameters[0].name), toys.hypothesis("b")
+    end = toys.make_model_fit(
+        toys.draw_linearisation(toys.draw_jacobian(5, 4), 1, ["a", "b"], torch.zeros(3).double(), 0)
+    )
+    twin, other = (
+        replace(toys.make_hypothesis("a"), equivalent_parameter=end.model.parameters[0].name),
+        toys.make_hypothesis("b"),
+    )
     end = replace(end, linearisation=replace(end.linearisation, hypotheses=[twin, other]))
     rows = [SimpleNamespace(hypothesis=h, decision="inconclusive") for h in (twin, other)]
     found, none = SimpleNamespace(causes=[], minor=[], scores=rows, end=end), {"causes": [], "minor": []}
@@ -185,7 +192,7 @@ def test_what_does_the_same_as_a_fitted_number_is_not_waited_for():
 
 def test_an_experiment_feels_what_the_data_felt():
     """Forces without torques are no torques that would be felt."""
-    seen = sheet_episodes.recorded("slow", lambda world: world, 0)
+    seen = sheet_episodes.record_changed_world("slow", lambda world: world, 0)
     pulled = {name: replace(g, force=np.tile([0, 0, -0.04], (len(g.t), 1))) for name, g in seen.grippers.items()}
     seen = replace(seen, grippers=pulled)
     model = build_base_model(seen)

@@ -12,25 +12,27 @@ from torchcloth.diagnosis.decide.search import replace_by_law
 from torchcloth.diagnosis.inference.comparison import compare, predict_held_out
 from torchcloth.diagnosis.inference.fitting import reweight_by_noise
 
-SLOPES = toys.smooth(1, 5)  # two parameters, a cause, a law, a nuisance
-NAMES = [f"motion {k}" for k in range(toys.EPISODES)]
+SLOPES = toys.draw_jacobian(1, 5)  # two parameters, a cause, a law, a nuisance
+NAMES = [f"motion {k}" for k in range(toys.EPISODE_COUNT)]
 
 
 def models(cause, law):
     """(start, end with the cause, with the law) of a world in which both have these amplitudes."""
-    every = toys.evidence(SLOPES, 4, [], torch.tensor([0.0, 0.0, cause, law]).double(), 0)
+    every = toys.draw_linearisation(SLOPES, 4, [], torch.tensor([0.0, 0.0, cause, law]).double(), 0)
 
     def model(*columns):
         cells = [c._replace(jacobian=c.jacobian[:, [*columns, 4]]) for c in every.bins]
-        return toys.fitted(replace(every, bins=cells, n_coordinates=len(columns)), std=5.0)
+        return toys.make_model_fit(replace(every, bins=cells, n_coordinates=len(columns)), std=5.0)
 
     return model(0, 1), model(0, 1, 2), model(0, 1, 3)
 
 
 def doubted(monkeypatch, cause, law, useful=True):
     start, end, other = models(cause, law)
-    best = SimpleNamespace(fit=other, sole_informative_motion=set(), hypothesis=toys.hypothesis("a"))
-    own = SimpleNamespace(candidate=SimpleNamespace(sole_informative_motion=set(), hypothesis=toys.hypothesis("c")))
+    best = SimpleNamespace(fit=other, sole_informative_motion=set(), hypothesis=toys.make_hypothesis("a"))
+    own = SimpleNamespace(
+        candidate=SimpleNamespace(sole_informative_motion=set(), hypothesis=toys.make_hypothesis("c"))
+    )
     monkeypatch.setattr(search, "evaluate_candidates", lambda *_: SimpleNamespace(candidate=best) if useful else None)
     first = predict_held_out(reweight_by_noise(start, end.noise, end.linearisation), NAMES)
     whole = compare(first, predict_held_out(end, NAMES), 0.0)

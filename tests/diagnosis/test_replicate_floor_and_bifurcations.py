@@ -38,7 +38,7 @@ def test_the_floor_is_what_repetitions_differ_by_whatever_the_model_gets_wrong()
 
 def test_repetitions_are_of_one_command(tmp_path):
     def kept(name, motion, split, shift=0.0, turn=1.0):
-        own = replace(sheet_episodes.episode(motion), split=split)
+        own = replace(sheet_episodes.make_episode(motion), split=split)
         facing = np.array([turn, 0.0, 0.0, (1 - turn**2) ** 0.5])
         moved = {
             n: replace(g, position=g.position + shift * g.t[:, None], quat_wxyz=np.tile(facing, (len(g.t), 1)))
@@ -63,7 +63,7 @@ def test_repetitions_are_of_one_command(tmp_path):
 
 
 def test_first_shapes_are_off_by_smooth_fields_along_the_normal_there_and_back():
-    blank = sheet_episodes.episode()
+    blank = sheet_episodes.make_episode()
     model = build_base_model(blank)
     (e,) = prepare_data(model, [blank]).episodes
     begun = _perturb_initial_shape(e, model.build_world(), torch.Generator().manual_seed(0))
@@ -87,8 +87,8 @@ def test_first_shapes_are_off_by_smooth_fields_along_the_normal_there_and_back()
 
 
 def test_a_cell_that_does_not_follow_its_slope_is_left_out():
-    slopes = toys.smooth(3, 4)
-    found = toys.fitted(toys.evidence(slopes, 1, ["one", "two"], torch.zeros(3).double(), 0))
+    slopes = toys.draw_jacobian(3, 4)
+    found = toys.make_model_fit(toys.draw_linearisation(slopes, 1, ["one", "two"], torch.zeros(3).double(), 0))
     cells = found.linearisation.bins[0]
     step = torch.tensor([0.2]).double()
     follows = cells._replace(value=cells.value + cells.jacobian[:, 0] * 0.2)
@@ -107,7 +107,9 @@ def test_a_cell_that_does_not_follow_its_slope_is_left_out():
 @pytest.mark.parametrize("share", [0.4, 0.6])
 def test_what_forgets_how_it_began_is_left_out_only_where_that_is_more_than_it_is_off(share):
     """Of the cells that are 3 mm off some are moved by 2 mm by another first shape, and twelve by 20."""
-    found = toys.fitted(toys.evidence(toys.smooth(3, 4), 1, ["one", "two"], torch.zeros(3).double(), 0))
+    found = toys.make_model_fit(
+        toys.draw_linearisation(toys.draw_jacobian(3, 4), 1, ["one", "two"], torch.zeros(3).double(), 0)
+    )
     cells = found.linearisation.bins[0]
     count = round(share * len(cells.value))
     off = 3e-3 * (1 - 2 * (torch.arange(len(cells.value)) % 2)).double()

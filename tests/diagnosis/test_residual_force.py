@@ -26,7 +26,7 @@ MOTIONS = ("slow", "fast")
 
 
 def recorded(change, seed):
-    return [sheet_episodes.recorded(motion, change, seed + k) for k, motion in enumerate(MOTIONS)]
+    return [sheet_episodes.record_changed_world(motion, change, seed + k) for k, motion in enumerate(MOTIONS)]
 
 
 @pytest.fixture(scope="module")
@@ -81,7 +81,7 @@ def test_it_is_written_with_the_answer(without_air, tmp_path):
 
 
 def test_it_is_kept_with_the_model_and_can_be_left_out(tmp_path):
-    recording = sheet_episodes.episode()
+    recording = sheet_episodes.make_episode()
     plain = build_base_model(recording)
     terms = {"across2": 0.8, "mass@edge": 0.05}
     extended = plain.at_point(plain.point + 0.1)

@@ -24,10 +24,13 @@ def episodes():
     torch.set_default_dtype(torch.float64)
     drag = next(
         h
-        for h in list_hypotheses(build_base_model(sheet_episodes.episode()), [sheet_episodes.episode()])
+        for h in list_hypotheses(build_base_model(sheet_episodes.make_episode()), [sheet_episodes.make_episode()])
         if h.name == "air.drag_n"
     )
-    yield [sheet_episodes.recorded(m, lambda world: drag.apply(world, 1.5), k) for k, m in enumerate(("slow", "fast"))]
+    yield [
+        sheet_episodes.record_changed_world(m, lambda world: drag.apply(world, 1.5), k)
+        for k, m in enumerate(("slow", "fast"))
+    ]
     torch.set_default_dtype(before)
 
 

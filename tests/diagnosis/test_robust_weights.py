@@ -13,14 +13,14 @@ from torchcloth.diagnosis.inference.fitting import gauss_newton_step
 from torchcloth.diagnosis.inference.noise import Noise, whiten
 from torchcloth.diagnosis.inference.robust_weights import reweight, t_log_density, t_weights
 
-SLOPES = toys.smooth(1, 4)  # three parameters, one nuisance
+SLOPES = toys.draw_jacobian(1, 4)  # three parameters, one nuisance
 TRUTH = torch.tensor([0.2, -0.3, 0.7]).double()
-LEVEL = Noise(torch.full((5,), toys.SLOW).double())
+LEVEL = Noise(torch.full((5,), toys.SLOW_ERROR_M).double())
 
 
 def drawn(seed, flipped=0.0, truth=TRUTH):
     """Evidence in which the cloth of one episode lies ``flipped`` metres off for two of its six windows."""
-    ev = toys.evidence(SLOPES, 3, [], truth, seed)
+    ev = toys.draw_linearisation(SLOPES, 3, [], truth, seed)
     first = ev.bins[0]
     away = flipped * ((first.window == 2) | (first.window == 3)).double()
     return ev.__class__(
@@ -47,7 +47,7 @@ def test_kinds_windows_and_episodes_are_stretches_of_their_own():
     ev = drawn(0)
     two = torch.cat([torch.zeros(48), torch.ones(48)]).long()
     cells = [ev.bins[0]._replace(block=two), ev.bins[1]]
-    assert len(time_blocks(cells).unique()) == 2 * toys.WINDOWS + toys.WINDOWS
+    assert len(time_blocks(cells).unique()) == 2 * toys.WINDOW_COUNT + toys.WINDOW_COUNT
 
 
 def test_cloth_that_folds_over_for_a_while_moves_no_parameter():
@@ -55,7 +55,7 @@ def test_cloth_that_folds_over_for_a_while_moves_no_parameter():
     plain, calm = [], []
     for seed in range(20):
         ev = drawn(seed, 0.03)
-        model = toys.fitted(ev).model
+        model = toys.make_model_fit(ev).model
         for white, out in ((whiten(ev, LEVEL), plain), (reweight(whiten(ev, LEVEL)), calm)):
             step, _ = gauss_newton_step(white, model)
             own = white.jacobian[:, :3]
@@ -77,13 +77,15 @@ def test_a_number_that_the_others_leave_open_is_no_failure_of_the_prediction():
     """Only the first motion tells of the third parameter: with and without it, the others predict the first as well."""
     slopes = SLOPES.clone()
     slopes[1:, :, 2] = 0.0
-    ev = toys.evidence(slopes, 3, [], torch.tensor([0.0, 0.0, 0.5]).double(), 0)
+    ev = toys.draw_linearisation(slopes, 3, [], torch.tensor([0.0, 0.0, 0.5]).double(), 0)
     less = ev.__class__(
         [c._replace(jacobian=c.jacobian[:, [0, 1, 3]]) for c in ev.bins], 2, [], ev.nuisance_stds, ev.mesh_differences
     )
     groups = ["a", "b", "c", "d"]
     whole = compare(
-        predict_held_out(toys.fitted(less), groups), predict_held_out(toys.fitted(ev, std=1.0), groups), 0.0
+        predict_held_out(toys.make_model_fit(less), groups),
+        predict_held_out(toys.make_model_fit(ev, std=1.0), groups),
+        0.0,
     )
     assert whole.log_density > 10.0  # that it may be anything is far better than that it is zero
     assert whole.robust_rms[1] < whole.robust_rms[0]
@@ -94,7 +96,7 @@ def test_what_ripples_does_not_count_in_millimetres():
     away = drawn(0, 0.03)
     rough = 0.02 * ((away.bins[0].window == 2) | (away.bins[0].window == 3)).double()
     known = replace(away, bins=[away.bins[0]._replace(roughness=rough), *away.bins[1:]])
-    plain, told = (predict_held_out(toys.fitted(ev), list("abcd")) for ev in (drawn(0), known))
+    plain, told = (predict_held_out(toys.make_model_fit(ev), list("abcd")) for ev in (drawn(0), known))
     assert float(told.smooth_fraction.min()) < 1e-3
     assert float(told.smooth_fraction[told.episode > 0].min()) == 1.0
     assert compare(told, told, 0.0).rms_before > 3 * compare(plain, plain, 0.0).rms_before
@@ -103,7 +105,7 @@ def test_what_ripples_does_not_count_in_millimetres():
 
 def test_what_one_episode_tells_is_not_thinned_by_the_others():
     """A millimetre is mended in one of four episodes."""
-    told = predict_held_out(toys.fitted(drawn(0)), list("abcd"))
+    told = predict_held_out(toys.make_model_fit(drawn(0)), list("abcd"))
     first = (told.episode == 0).double()
     wrong = told._replace(residual=told.residual + 1e-3 * first)
     gain = compare(wrong, told, 0.0)

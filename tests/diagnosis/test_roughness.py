@@ -14,15 +14,17 @@ from torchcloth.diagnosis.inference.linearise import Linearisation, central_diff
 
 TRUTH, STEP = 0.3, 0.1
 RIPPLES, LENGTH = 2e-3, 0.15  # m, of ripples that come and go within so much of the parameter
-SMOOTH = toys.smooth(3, 2)
+SMOOTH = toys.draw_jacobian(3, 2)
 
 
 @pytest.fixture
 def rippling(monkeypatch):
     """A model of one parameter; in a third of each episode ripples hide what it does."""
-    there = toys.fitted(toys.evidence(SMOOTH, 1, [], torch.tensor([TRUTH]).double(), 0))
-    rng, size = torch.Generator().manual_seed(4), len(toys.grid().value)
-    phases, real = 2 * math.pi * torch.rand(2, toys.EPISODES, size, generator=rng)  # real cloth has ripples of its own
+    there = toys.make_model_fit(toys.draw_linearisation(SMOOTH, 1, [], torch.tensor([TRUTH]).double(), 0))
+    rng, size = torch.Generator().manual_seed(4), len(toys.make_cells().value)
+    phases, real = (
+        2 * math.pi * torch.rand(2, toys.EPISODE_COUNT, size, generator=rng)
+    )  # real cloth has ripples of its own
 
     def seen(k, at):
         cells = there.linearisation.bins[k]

@@ -119,7 +119,7 @@ def test_the_example_of_the_docs_is_one(file):
     file.write_text(example)
     (travel,) = register_file(file)
     hypotheses.unregister(travel.name)
-    recording = sheet_episodes.episode()
+    recording = sheet_episodes.make_episode()
     model = build_base_model(recording)
     (episode,) = prepare_data(model, [recording]).episodes
     before, after = (

@@ -54,7 +54,7 @@ WRONG = {
 
 @pytest.fixture
 def world():
-    recordings = [sheet_episodes.episode(motion) for motion in ("slow", "fast")]
+    recordings = [sheet_episodes.make_episode(motion) for motion in ("slow", "fast")]
     model = build_base_model(recordings[0])
     return recordings, model, prepare_data(model, recordings)
 

@@ -12,7 +12,7 @@ from torchcloth.episodes.world import Hypothesis
 from torchcloth.episodes.world_cache import WorldCache
 from torchcloth.errors import InvalidInput
 
-RECORDING = sheet_episodes.episode()
+RECORDING = sheet_episodes.make_episode()
 
 
 @pytest.fixture

@@ -28,7 +28,7 @@ def _stand_ins(tmp_path_factory):
     base = tmp_path_factory.getbasetemp()
     shared = (base.parent if "PYTEST_XDIST_WORKER" in os.environ else base) / "stand-ins"
     shared.mkdir(exist_ok=True)
-    cuda_on_host.SHARED[:] = [shared]
+    cuda_on_host.BUILD_FOLDER[:] = [shared]
 
 
 @pytest.fixture(params=[1, 3], ids=["alone", "team"])

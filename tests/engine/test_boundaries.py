@@ -2,7 +2,7 @@
 
 import pytest
 import torch
-from helpers.engine_agreement import agree, noise
+from helpers.engine_agreement import check_agreement, draw_noise
 from torch import Tensor
 
 import torchcloth as tc
@@ -75,8 +75,8 @@ def sheet(boundaries, effects=None) -> tc.Cloth:
 def falling(cloth: tc.Cloth, depth: float = 0.0, scenes: tuple[int, ...] = (), speed: float = 0.5):
     """Uneven, about z = 0; half of the vertices fall straight, the others slide."""
     x = cloth.rest_state().x - torch.tensor([0.05, 0.05, depth])
-    x = x + 1e-3 * noise((*scenes, *x.shape), 1)
-    v = noise(x.shape, 2)
+    x = x + 1e-3 * draw_noise((*scenes, *x.shape), 1)
+    v = draw_noise(x.shape, 2)
     v[..., ::2, :2] *= 0.05
     v[..., 2] = -v[..., 2].abs()
     return cloth.state(x, speed * v)
@@ -86,7 +86,7 @@ def path(scenes: tuple[int, ...] = (), closed=(True, True, True)) -> tc.Trajecto
     """10 ms; turns and wanders."""
     pose = torch.eye(4).repeat(*scenes, 3, 1, 1)
     pose[..., :2, :2] = rotation(torch.linspace(0, 0.05, 3))
-    pose[..., :3, 3] = 2e-3 * noise((*scenes, 3, 3), 5)
+    pose[..., :3, 3] = 2e-3 * draw_noise((*scenes, 3, 3), 5)
     return tc.Trajectory(torch.linspace(0, 0.01, 3, dtype=torch.float64), pose, torch.tensor(closed))
 
 
@@ -120,7 +120,7 @@ def test_solids(solid, law, moving, monkeypatch):
     body = SOLIDS[solid](friction=LAWS[law](), moving=moving, offset=1e-4)
     cloth = sheet({"body": body})
     seen = watched(monkeypatch)
-    agree(cloth, moves(cloth), falling(cloth))
+    check_agreement(cloth, moves(cloth), falling(cloth))
     assert all(seen.values()), seen
 
 
@@ -130,13 +130,13 @@ def test_contact_points(solid, moving):
     made = SMALL[solid](sampling=0.01, moving=moving)
     cloth, bare = sheet({"body": made}), sheet({"body": SMALL[solid](moving=moving)})
     state = falling(cloth, 5e-4)
-    agree(cloth, moves(cloth), state)
+    check_agreement(cloth, moves(cloth), state)
     assert float((run(cloth, state).v - run(bare, state).v).norm()) > 1e-3  # the points matter
 
 
 def test_contact_points_of_uneven_mass():
     cloth = sheet({"body": SMALL["box"](sampling=0.01)}, {"hem": LineMass(5e-3)})
-    agree(cloth, moves(cloth), falling(cloth, 5e-4))
+    check_agreement(cloth, moves(cloth), falling(cloth, 5e-4))
 
 
 def run(cloth, state, substeps=20):
@@ -149,12 +149,12 @@ def run(cloth, state, substeps=20):
 def test_no_fast_point_is_missed():
     """Up to 2 mm per substep."""
     cloth = sheet({"body": SMALL["box"](sampling=0.01)})
-    agree(cloth, {}, falling(cloth, -5e-3, speed=10.0), substeps=20)
+    check_agreement(cloth, {}, falling(cloth, -5e-3, speed=10.0), substeps=20)
 
 
 def test_points_as_far_apart_as_vertices():
     cloth = sheet({"body": Plane(sampling=1.0)})
-    agree(cloth, {}, falling(cloth))
+    check_agreement(cloth, {}, falling(cloth))
 
 
 @pytest.mark.parametrize("sampling", [None, 0.012])
@@ -163,16 +163,16 @@ def test_batch(sampling):
     friction = Stribeck(0.2, 0.5)
     box = Box((0.08, 0.09, 0.2), turned(-0.1), friction, moving=True, sampling=sampling)
     friction.raw = torch.nn.Parameter(torch.tensor([[0.2], [0.5], [0.8]]))
-    box.size.raw = torch.nn.Parameter(box.size.raw + 0.05 * noise((3, 3), 7))
+    box.size.raw = torch.nn.Parameter(box.size.raw + 0.05 * draw_noise((3, 3), 7))
     cloth = sheet({"box": box, "ball": Sphere(0.2, (0.0, 0.0, -0.2), Coulomb(torch.tensor([[0.1], [0.2], [0.3]])))})
-    agree(cloth, moves(cloth, (3,)), falling(cloth, 4e-3, (3,)))
+    check_agreement(cloth, moves(cloth, (3,)), falling(cloth, 4e-3, (3,)))
 
 
 def test_a_batch_of_ellipses():
     along, across = torch.tensor([[0.1], [0.4]]), torch.tensor([[0.5], [0.2]])
     together, alone = (sheet({"table": Plane(friction=Elliptic(*mu))}) for mu in ((along, across), (0.4, 0.2)))
     state = falling(together, 4e-3, (2,))
-    agree(together, {}, state)
+    check_agreement(together, {}, state)
     times = (0.0, 4e-3)
     first, second = (alone(alone.state(x, v), times=times).x[-1] for x, v in zip(state.x, state.v, strict=True))
     both = together(state, times=times).x[:, -1]
@@ -189,7 +189,7 @@ def test_what_bodies_give_with_the_air(law, sampling):
         Plane(normal=(slope, 0.0, 1.0), friction=LAWS[law](), sampling=sampling),
     ):
         cloth = sheet({"box": body}, {"air": AddedMass(0.1)})
-        agree(cloth, moves(cloth), falling(cloth, 1e-3))
+        check_agreement(cloth, moves(cloth), falling(cloth, 1e-3))
 
 
 @pytest.mark.parametrize(
@@ -206,7 +206,7 @@ def test_what_bodies_give_with_the_air(law, sampling):
 def test_grips(hold, mobility, closed, air):
     cloth = sheet({"hand": Grasp([0, 1, 6, 7]), "floor": Plane()}, {"slip": GripSlip("hand", mobility, hold), **air})
     state = falling(cloth)
-    agree(cloth, {"hand": path(closed=closed)}, state)
+    check_agreement(cloth, {"hand": path(closed=closed)}, state)
     perfect = sheet({"hand": Grasp([0, 1, 6, 7]), "floor": Plane()}, air)
     assert torch.equal(run(cloth, state).x, run(perfect, state).x) == (hold == 100.0)
 
@@ -222,7 +222,7 @@ def test_one_after_another():
         "other": Grasp([34, 35]),
     }
     cloth = sheet(boundaries, effects)
-    agree(cloth, moves(cloth), falling(cloth, 5e-4))
+    check_agreement(cloth, moves(cloth), falling(cloth, 5e-4))
 
 
 def test_contact_does_not_hang_on_rounding():

@@ -4,7 +4,7 @@ import warnings
 
 import pytest
 import torch
-from helpers.engine_cloths import close, opening, sheet, start
+from helpers.engine_cloths import check_close, make_opening_motion, make_perturbed_state, make_sheet
 
 import torchcloth as tc
 from torchcloth.boundaries import AbstractBoundary
@@ -30,11 +30,11 @@ class Floor(AbstractBoundary):
 
 def outcome(engine, batch=(), settle=False, checkpoint=True, times=TIMES, **options):
     """All that comes out of a simulation, and all gradients."""
-    cloth = sheet(engine, **options)
-    motion = opening(END)
+    cloth = make_sheet(engine, **options)
+    motion = make_opening_motion(END)
     leaves = {name: t.pose.clone().requires_grad_() for name, t in motion.items()}
     motion = {name: t._replace(pose=leaves[name]) for name, t in motion.items()}
-    state = start(cloth, batch)
+    state = make_perturbed_state(cloth, batch)
     x, v = state.x.clone().requires_grad_(), state.v.clone().requires_grad_()
     state = state._replace(x=x, v=v)
     if settle:
@@ -68,12 +68,12 @@ def test_fused_equals_reference(case):
     parts, grads = outcome("fused", **options())
     expected, slopes = outcome("reference", **options())
     for name, value in parts.items():
-        close(value, expected[name], 1e-10, name)
+        check_close(value, expected[name], 1e-10, name)
     assert [n for n, g in grads.items() if g is None] == [n for n, g in slopes.items() if g is None]
     for name, grad in grads.items():
         if grad is not None:
             assert grad.shape == slopes[name].shape
-            close(grad, slopes[name], 1e-8, f"gradient of {name}")
+            check_close(grad, slopes[name], 1e-8, f"gradient of {name}")
 
 
 def test_auto_is_fused_where_it_can_be():
@@ -90,10 +90,10 @@ def test_float32():
     parts, grads = outcome("fused")
     for name, value in parts.items():
         assert value.dtype == torch.float32
-        close(value.double(), exact[name], 1e-4, name)
+        check_close(value.double(), exact[name], 1e-4, name)
     for name, grad in grads.items():
         if grad is not None:
-            close(grad.double(), fine[name], 1e-3, name)
+            check_close(grad.double(), fine[name], 1e-3, name)
 
 
 @pytest.mark.parametrize("thin", [1e-3, 1e-4, 1e-5])
@@ -108,7 +108,7 @@ def test_slivers_in_float32(thin):
         state = cloth.state(rest.x @ squeezed)
         results.append(cloth(state, times=(0.0, 1e-5), dt=1e-5).v[-1])
     assert bool(results[1].isfinite().all())
-    close(results[1], results[0], 1e-2, "velocity")
+    check_close(results[1], results[0], 1e-2, "velocity")
 
 
 @pytest.mark.parametrize("budget", [0, 40_000, 10**9])
@@ -121,13 +121,13 @@ def test_memory_budget_changes_nothing(budget, monkeypatch):
     for name, grad in results.items():
         assert (grad is None) == (expected[name] is None), name
         if grad is not None:
-            close(grad, expected[name], 1e-12, name)
+            check_close(grad, expected[name], 1e-12, name)
 
 
 def test_records_are_kept_while_the_budget_lasts(monkeypatch):
     """Three intervals, room for the records of one and a half: the first keeps, the others go through it again."""
-    cloth, intervals = sheet("fused"), []
-    model, state = cloth.build_model(), start(cloth)
+    cloth, intervals = make_sheet("fused"), []
+    model, state = cloth.build_model(), make_perturbed_state(cloth)
     prescribed = stationary_prescribed(model, 9)
     size = execution.full_size(FusedEngine(model, state, prescribed).builder.program, 1, 9)
     monkeypatch.setattr(execution, "RECORD_BUDGET_BYTES", int(1.5 * size))
@@ -151,9 +151,9 @@ def test_a_loop_without_gradients_keeps_no_records(monkeypatch):
         "forward",
         lambda job, record_interval=0: intervals.append(record_interval) or forward(job, record_interval),
     )
-    cloth = sheet("fused")
+    cloth = make_sheet("fused")
     with torch.no_grad():
-        cloth(start(cloth), opening(END), TIMES)
+        cloth(make_perturbed_state(cloth), make_opening_motion(END), TIMES)
     assert set(intervals) == {0}
 
 
@@ -194,41 +194,43 @@ def test_changes_between_calls_are_seen(change):
     """Programs are cached between calls, but never one that is no longer right."""
     results = {}
     for engine in ("fused", "reference"):
-        cloth = sheet(engine)
-        before = cloth(start(cloth), opening(END), TIMES).x.detach()
+        cloth = make_sheet(engine)
+        before = cloth(make_perturbed_state(cloth), make_opening_motion(END), TIMES).x.detach()
         change(cloth)
-        results[engine] = cloth(start(cloth), opening(END), TIMES).x.detach()
+        results[engine] = cloth(make_perturbed_state(cloth), make_opening_motion(END), TIMES).x.detach()
         assert not torch.equal(before, results[engine])
-    close(results["fused"], results["reference"], 1e-10, change.__name__)
+    check_close(results["fused"], results["reference"], 1e-10, change.__name__)
 
 
 def test_the_engine_may_be_set_at_any_time():
-    cloth = sheet("fused")
-    first = cloth(start(cloth), opening(END), TIMES).x
+    cloth = make_sheet("fused")
+    first = cloth(make_perturbed_state(cloth), make_opening_motion(END), TIMES).x
     cloth.engine = "reference"
-    second = cloth(start(cloth), opening(END), TIMES).x
+    second = cloth(make_perturbed_state(cloth), make_opening_motion(END), TIMES).x
     assert not torch.equal(first, second)
-    close(first, second, 1e-10, "x")
+    check_close(first, second, 1e-10, "x")
     with pytest.raises(InvalidInput, match='engine; got \'fast\'; expected "auto", "reference" or "fused"'):
         cloth.engine = "fast"
     assert cloth.engine == "reference"
     with pytest.raises(InvalidInput, match="engine"):
-        sheet("CUDA")
+        make_sheet("CUDA")
 
 
 # -- words ------------------------------------------------------------------------------------------------------------
 
 
 def test_print_says_which_engine_runs_and_why():
-    assert "\n  engine: fused\n" in str(sheet())
-    assert sheet().engine_in_use == "fused"
-    assert sheet("reference").engine_in_use == "reference (as asked for)"
-    assert "engine: reference (as asked for)" in str(sheet("reference"))
-    assert "engine: reference (boundary 'floor' (Floor) has no kernels)" in str(sheet(boundaries={"floor": Floor()}))
+    assert "\n  engine: fused\n" in str(make_sheet())
+    assert make_sheet().engine_in_use == "fused"
+    assert make_sheet("reference").engine_in_use == "reference (as asked for)"
+    assert "engine: reference (as asked for)" in str(make_sheet("reference"))
+    assert "engine: reference (boundary 'floor' (Floor) has no kernels)" in str(
+        make_sheet(boundaries={"floor": Floor()})
+    )
 
 
 def test_other_precisions_and_devices_are_left_to_the_reference():
-    cloth = sheet()
+    cloth = make_sheet()
     model, state = cloth.build_model(), cloth.rest_state()
     for other, why in (
         (state.map(lambda t: t.half()), "float16"),
@@ -240,29 +242,31 @@ def test_other_precisions_and_devices_are_left_to_the_reference():
 def test_unknown_boundary_runs_on_the_reference_without_a_warning():
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        auto, reference = (sheet(engine, boundaries={"floor": Floor()}) for engine in ("auto", "reference"))
-        assert torch.equal(auto(start(auto), times=TIMES).x, reference(start(reference), times=TIMES).x)
+        auto, reference = (make_sheet(engine, boundaries={"floor": Floor()}) for engine in ("auto", "reference"))
+        assert torch.equal(
+            auto(make_perturbed_state(auto), times=TIMES).x, reference(make_perturbed_state(reference), times=TIMES).x
+        )
 
 
 def test_fused_refuses_what_it_cannot():
-    cloth = sheet("fused", boundaries={"floor": Floor()})
+    cloth = make_sheet("fused", boundaries={"floor": Floor()})
     message = r"""engine; got "fused"; expected .*boundary 'floor' \(Floor\) has no kernels; use engine="auto\""""
     with pytest.raises(InvalidInput, match=message):
-        cloth(start(cloth), times=TIMES)
+        cloth(make_perturbed_state(cloth), times=TIMES)
 
 
 def test_divergence_names_time_and_vertex():
     """A pose that jumps tears the cloth; the engine goes through the interval again to say where."""
     messages = []
     for engine in ("fused", "reference"):
-        cloth = sheet(engine, effects={})
+        cloth = make_sheet(engine, effects={})
         state = cloth.rest_state()
         v = state.v.clone()
         v[7] = 1e200
         with pytest.raises(
             SimulationDiverged, match=r"t = .*; got vertex \d+ not finite after substep \d+ of"
         ) as caught:
-            cloth(state._replace(v=v), opening(END, "nobody"), (0.0, END))
+            cloth(state._replace(v=v), make_opening_motion(END, "nobody"), (0.0, END))
         messages.append(str(caught.value))
     assert messages[0] == messages[1]
 
@@ -270,8 +274,11 @@ def test_divergence_names_time_and_vertex():
 def test_a_state_dict_and_a_copy_keep_working():
     import copy
 
-    cloth = sheet("fused")
+    cloth = make_sheet("fused")
     twin = copy.deepcopy(cloth)
     twin.load_state_dict(cloth.state_dict())
     assert twin.engine == "fused"
-    assert torch.equal(twin(start(twin), opening(END), TIMES).x, cloth(start(cloth), opening(END), TIMES).x)
+    assert torch.equal(
+        twin(make_perturbed_state(twin), make_opening_motion(END), TIMES).x,
+        cloth(make_perturbed_state(cloth), make_opening_motion(END), TIMES).x,
+    )

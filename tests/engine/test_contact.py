@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 import torch.autograd.forward_ad as forward_ad
-from helpers.engine_agreement import agree, difference, moving_hand, noise, outcome
+from helpers.engine_agreement import check_agreement, compute_outcome, draw_noise, make_moving_hand, relative_difference
 
 import torchcloth as tc
 from torchcloth.dynamics import substep
@@ -29,7 +29,7 @@ def layers(contact: tc.Contact, *, effects=None, boundaries=None, woven=False):
         np.concatenate([below.faces, above.faces + count]),
         np.concatenate([below.uv, above.uv + np.array([1.0, 0.0])]),
     )
-    around = 1 + 0.2 * noise((len(mesh.faces),), 5).clamp(-2, 2).to(torch.get_default_dtype())
+    around = 1 + 0.2 * draw_noise((len(mesh.faces),), 5).clamp(-2, 2).to(torch.get_default_dtype())
     law = {"contact_stiffness": 5e4 * around, "shear_stiffness": 3e3, "cone": 0.6 * around.flip(0)}
     material = tc.materials.OrthotropicAEP(6e4, 4e4, 2e4, **law) if woven else tc.materials.AEP(6e4, **law)
     effects = effects or {"gravity": tc.effects.Gravity()}
@@ -39,14 +39,14 @@ def layers(contact: tc.Contact, *, effects=None, boundaries=None, woven=False):
 def pressed(cloth, count, scenes=(), sideways=1.0, down=-1.0, steps=60):
     """A state of layers that have come together, some points slipping on each other and some not."""
     rest = cloth.rest_state().x
-    x = rest + 2e-4 * noise((*scenes, *rest.shape), 1).to(rest)
-    v = 0.2 * noise((*scenes, *rest.shape), 2).to(rest)
+    x = rest + 2e-4 * draw_noise((*scenes, *rest.shape), 1).to(rest)
+    v = 0.2 * draw_noise((*scenes, *rest.shape), 2).to(rest)
     v[..., count:, 2] += down
     v[..., count:, 0] += sideways * (rest[count:, 1] > 0.05)
     with torch.no_grad():
         state, _ = substep.rollout(cloth.build_model(), cloth.state(x, v), 1e-4, {}, steps)
-    memory = {"contact": state.memory["contact"] + noise(state.memory["contact"].shape, 3).to(rest)}
-    return state._replace(d3=state.d3 * (1 + 0.05 * noise((*state.d3.shape[:-1], 1), 6).to(rest)), memory=memory)
+    memory = {"contact": state.memory["contact"] + draw_noise(state.memory["contact"].shape, 3).to(rest)}
+    return state._replace(d3=state.d3 * (1 + 0.05 * draw_noise((*state.d3.shape[:-1], 1), 6).to(rest)), memory=memory)
 
 
 def branches(cloth, state) -> dict[str, int]:
@@ -75,7 +75,7 @@ def test_pressed_and_sliding(subdivisions):
     state = pressed(cloth, count)
     results = branches(cloth, state)
     assert min(results.values()) > 3, results
-    print(results, agree(cloth, {}, state))
+    print(results, check_agreement(cloth, {}, state))
 
 
 @pytest.mark.usefixtures("team")
@@ -92,12 +92,12 @@ def test_with_air_hand_and_woven_cloth():
         boundaries={"hand": tc.boundaries.Grasp([9, 10, 30])},
         woven=True,
     )
-    print(agree(cloth, {"hand": moving_hand(0.01)}, pressed(cloth, count)))
+    print(check_agreement(cloth, {"hand": make_moving_hand(0.01)}, pressed(cloth, count)))
 
 
 def test_everywhere():
     cloth, count = layers(tc.Contact(spacing=SPACING, everywhere=True, free_compression=0.0, damping=0.0))
-    print(agree(cloth, {}, pressed(cloth, count, steps=40), substeps=60))
+    print(check_agreement(cloth, {}, pressed(cloth, count, steps=40), substeps=60))
 
 
 def folded(contact):
@@ -109,7 +109,7 @@ def folded(contact):
     x[over, 0], x[over, 2] = 0.4 - x[over, 0], 1.3 * SPACING
     v = torch.zeros_like(x)
     v[over, 0] = -9.0
-    v[:, 2] = 0.1 * noise((len(x),), 4)
+    v[:, 2] = 0.1 * draw_noise((len(x),), 4)
     return cloth, cloth.state(x, v)
 
 
@@ -127,7 +127,7 @@ def test_triangles_come_and_go():
     assert len(seen) > 3
     assert any(b - a for a, b in pairwise(seen))
     assert any(a - b for a, b in pairwise(seen))
-    print([len(s) for s in seen], agree(cloth, {}, state, substeps=120, dt=5e-5))
+    print([len(s) for s in seen], check_agreement(cloth, {}, state, substeps=120, dt=5e-5))
 
 
 @torch.no_grad()
@@ -142,7 +142,7 @@ def test_a_sheet_alone_is_bitwise_one_without_contact():
     assert torch.equal(runs[0].x, runs[1].x)
     assert torch.equal(runs[0].v, runs[1].v)
     normals = substep.surface(cloth.build_model().geometry, runs[1].x, runs[1].v).n
-    assert difference(runs[1].d3, normals.repeat_interleave(cloth.contact_grid().points.shape[0], 0)) < 1e-12
+    assert relative_difference(runs[1].d3, normals.repeat_interleave(cloth.contact_grid().points.shape[0], 0)) < 1e-12
 
 
 def test_batch():
@@ -153,7 +153,7 @@ def test_batch():
         torch.tensor([[3e4], [5e4], [8e4]]).expand(3, faces).clone(), "Pa"
     )
     cloth.material.shear_stiffness = tc.PhysicalParameter(torch.tensor([[3e4], [2e4], [4e4]]), "Pa")
-    print(agree(cloth, {}, pressed(cloth, count, (3,)), substeps=40))
+    print(check_agreement(cloth, {}, pressed(cloth, count, (3,)), substeps=40))
 
 
 @pytest.mark.usefixtures("team")
@@ -164,7 +164,7 @@ def test_recomputed_substeps_are_bitwise_the_recorded_ones():
     adjoints = []
     for every in (1, 7, 120):
         results, records = execution.forward(job, every)
-        seeds = {f: noise(t.shape, k, t.dtype) for k, (f, t) in enumerate(results.items())}
+        seeds = {f: draw_noise(t.shape, k, t.dtype) for k, (f, t) in enumerate(results.items())}
         adjoints.append(execution.reverse(job, records, every, seeds, set(job.inputs)))
     for other in adjoints[1:]:
         assert all(torch.equal(value, other[f]) for f, value in adjoints[0].items())
@@ -187,7 +187,7 @@ def test_single_precision():
         start = (
             pressed(cloth, count, sideways=0.3, down=-0.2) if not results else results[0][1].map(lambda t: t.float())
         )
-        gradients = outcome(fused.rollout, cloth, {}, start, 1000, 2e-5).gradients
+        gradients = compute_outcome(fused.rollout, cloth, {}, start, 1000, 2e-5).gradients
         results.append(({k: g.double() for k, g in gradients.items() if g is not None}, start))
     for name, exact in results[0][0].items():
         rough = results[1][0][name]
@@ -207,7 +207,7 @@ def test_layers_that_pressed_on_each_other_while_they_settled_have_stopped():
     with torch.no_grad():
         settled = cloth.settle(state, duration=0.01, rate=SETTLING_DAMPING_RATE_PER_S)
         expected = cloth(settled, times=(0.0, 0.002))
-    assert difference(value.v, expected.v) < 1e-10
+    assert relative_difference(value.v, expected.v) < 1e-10
 
 
 def test_first_directors_know_how_near_layers_are():

@@ -7,8 +7,8 @@ from unittest.mock import patch
 import pytest
 import torch
 from helpers import cuda_on_host
-from helpers.engine_agreement import moving
-from helpers.engine_cloths import opening, sheet, start
+from helpers.engine_agreement import make_moving_state
+from helpers.engine_cloths import make_opening_motion, make_perturbed_state, make_sheet
 
 import torchcloth as tc
 from torchcloth.boundaries.motion import sample_trajectory
@@ -26,14 +26,14 @@ TIMES = [0.0, 0.01, 0.02]
 @contextmanager
 def elsewhere(**how):
     """Tensors of the CPU are a device's."""
-    with cuda_on_host.stand_in(**how), patch.object(devices, "is_on_device", lambda tensor: True):
+    with cuda_on_host.replace_device_by_host(**how), patch.object(devices, "is_on_device", lambda tensor: True):
         yield
 
 
 def job_of(cloth, scenes=(2,), substeps=12, state=None):
-    state, dt = moving(cloth, scenes) if state is None else state, 1e-4
+    state, dt = make_moving_state(cloth, scenes) if state is None else state, 1e-4
     times = torch.arange(substeps + 1, dtype=torch.float64) * dt
-    prescribed = {name: sample_trajectory(t, times) for name, t in opening(float(times[-1])).items()}
+    prescribed = {name: sample_trajectory(t, times) for name, t in make_opening_motion(float(times[-1])).items()}
     with patch.object(devices, "is_on_device", lambda tensor: True):
         fused = FusedEngine(cloth.build_model(), state, prescribed)
     job = fused.job(state, torch.full((substeps,), dt), prescribed)
@@ -52,10 +52,10 @@ def adjoints(job):
 @pytest.mark.parametrize("meets", [False, True])
 def test_order_of_threads_between_waits_does_not_matter(meets):
     """Bit by bit: nobody reads what another thread of a block writes before both have waited."""
-    cloth = sheet(contact=tc.Contact(), n=17) if meets else sheet()
+    cloth = make_sheet(contact=tc.Contact(), n=17) if meets else make_sheet()
     job, results = job_of(cloth, state=folded(cloth) if meets else None), []
     for reverse in (False, True):
-        with cuda_on_host.stand_in(4, reverse):
+        with cuda_on_host.replace_device_by_host(4, reverse):
             results.append((launch.forward(job)[0], adjoints(job)))
             assert bool(launch.forward(job)[1][:, :-1].any()) == meets, "layers that meet"
     for one, other in zip(*results, strict=True):
@@ -63,8 +63,8 @@ def test_order_of_threads_between_waits_does_not_matter(meets):
 
 
 def test_adjoints_do_not_depend_on_how_many_substeps_are_kept():
-    job = job_of(sheet())
-    with cuda_on_host.stand_in():
+    job = job_of(make_sheet())
+    with cuda_on_host.replace_device_by_host():
         usual = adjoints(job)
         with patch.object(launch, "MAX_CHUNK_SUBSTEPS", 5):
             other = adjoints(job)
@@ -74,7 +74,7 @@ def test_adjoints_do_not_depend_on_how_many_substeps_are_kept():
 
 def simulated(cloth, times=TIMES):
     """(rollout, gradients by name) of a batch."""
-    state, motion = start(cloth, (2,)), opening(times[-1])
+    state, motion = make_perturbed_state(cloth, (2,)), make_opening_motion(times[-1])
     poses = {name: t._replace(pose=t.pose.to(state.x).requires_grad_()) for name, t in motion.items()}
     x = state.x.clone().requires_grad_()
     cloth.zero_grad()
@@ -88,13 +88,13 @@ def simulated(cloth, times=TIMES):
 @pytest.mark.parametrize("contact", [tc.Contact(), None])
 def test_the_layer(contact, dtype, mark):
     torch.set_default_dtype(dtype)
-    cloth = sheet(contact=contact).to(dtype)
+    cloth = make_sheet(contact=contact).to(dtype)
     known, before = simulated(cloth)
     with elsewhere():
         assert cloth.engine_in_use == "fused"
         out, after = simulated(cloth)
         with torch.no_grad():
-            plain = cloth(start(cloth, (2,)), opening(TIMES[-1]), TIMES)
+            plain = cloth(make_perturbed_state(cloth, (2,)), make_opening_motion(TIMES[-1]), TIMES)
     for one, other in ((known.x, out.x), (known.x, plain.x), (known.wrench["left"], out.wrench["left"])):
         torch.testing.assert_close(other, one, rtol=0, atol=mark * float(one.detach().abs().max()))
     torch.testing.assert_close(out.state.d3, known.state.d3, rtol=0, atol=mark)
@@ -121,7 +121,7 @@ def folded(cloth):
 def test_layers_that_meet():
     """Folded, pressed by a hand and falling; values and gradients through the cloth."""
     hand = tc.boundaries.Sphere(0.05, (0.0, 0.1, 0.07), moving=True)
-    cloth = sheet(contact=tc.Contact(), n=17, boundaries={"hand": hand})
+    cloth = make_sheet(contact=tc.Contact(), n=17, boundaries={"hand": hand})
     results = []
     for where in (nullcontext(), elsewhere()):
         with where:
@@ -145,7 +145,7 @@ def test_layers_that_meet():
 
 def test_what_diverges_is_told():
     """And its points, which are nowhere, are not gathered in one place."""
-    cloth = sheet(contact=tc.Contact(), n=17, boundaries={})
+    cloth = make_sheet(contact=tc.Contact(), n=17, boundaries={})
     state = folded(cloth)
     state = state._replace(v=1e200 * torch.randn(state.v.shape))
     with elsewhere(), pytest.raises(tc.errors.SimulationDiverged, match="not finite"):
@@ -153,7 +153,7 @@ def test_what_diverges_is_told():
 
 
 def test_too_many_nodes_are_an_error(monkeypatch):
-    cloth = sheet(contact=tc.Contact(), n=17, boundaries={})
+    cloth = make_sheet(contact=tc.Contact(), n=17, boundaries={})
     small = property(lambda self: 16)
     monkeypatch.setattr(self_test, "matches_cpu", lambda job, rounding: True)  # it has enough for its own
     with (
@@ -170,19 +170,19 @@ def test_what_it_cannot_do_is_said():
 
     for effects, contact in (({"own": Own()}, None), ({"own": Own()}, tc.Contact())):
         with elsewhere():
-            assert "effects.own in torch, on cuda" in sheet(effects=effects, contact=contact).engine_in_use
+            assert "effects.own in torch, on cuda" in make_sheet(effects=effects, contact=contact).engine_in_use
     with elsewhere(), patch.object(launch, "kernels", side_effect=EngineUnavailable("no libnvrtc", "install it")):
         with pytest.warns(UserWarning, match="no libnvrtc: simulations run on the torch reference"):
-            assert sheet().engine_in_use == "reference (no libnvrtc)"
+            assert make_sheet().engine_in_use == "reference (no libnvrtc)"
         with pytest.raises(tc.errors.InvalidInput, match=r"no libnvrtc.*install it"):
-            sheet(engine="fused")(start(sheet()), opening(TIMES[-1]), TIMES)
+            make_sheet(engine="fused")(make_perturbed_state(make_sheet()), make_opening_motion(TIMES[-1]), TIMES)
 
 
 @pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
 def test_a_device_is_tried_once(dtype, monkeypatch):
     """On a fold that is pressed; one that does something else is not believed."""
     torch.set_default_dtype(dtype)
-    cloth = sheet(contact=tc.Contact(), n=17).to(dtype)
+    cloth = make_sheet(contact=tc.Contact(), n=17).to(dtype)
     tried, forward, agrees = [], launch.forward, self_test.matches_cpu
 
     def watched(job, rounding):
@@ -193,7 +193,7 @@ def test_a_device_is_tried_once(dtype, monkeypatch):
     for _ in range(2):
         with elsewhere():
             for scenes in ((), (2,)):
-                cloth(start(cloth, scenes), opening(2e-3), [0.0, 2e-3])
+                cloth(make_perturbed_state(cloth, scenes), make_opening_motion(2e-3), [0.0, 2e-3])
             assert cloth.engine_in_use == "fused"
     assert tried == [True, True], "layers met"
 
@@ -209,8 +209,8 @@ def test_a_device_is_tried_once(dtype, monkeypatch):
         dispatch._warn_once.cache_clear()
         with elsewhere():
             with pytest.warns(UserWarning, match=f"the engine on cpu {said}: simulations run on the torch reference"):
-                cloth(start(cloth), opening(2e-3), [0.0, 2e-3])
-            cloth(start(cloth), opening(2e-3), [0.0, 2e-3])
+                cloth(make_perturbed_state(cloth), make_opening_motion(2e-3), [0.0, 2e-3])
+            cloth(make_perturbed_state(cloth), make_opening_motion(2e-3), [0.0, 2e-3])
             assert cloth.engine_in_use.startswith("reference (the engine on cpu ")
     assert len(tried) == 2 + 2 * dispatch.SELF_TEST_SEEDS
 
@@ -247,11 +247,13 @@ def test_rounding_is_no_reason_to_doubt_a_device(monkeypatch, contact, n, offset
 
 
 def test_directions_are_the_references():
-    cloth = sheet()
+    cloth = make_sheet()
     along = tc.Directions({"areal_density.raw": torch.ones(1)})
-    known = cloth.sensitivities(start(cloth), opening(TIMES[-1]), TIMES, along=along)[1]
+    known = cloth.sensitivities(make_perturbed_state(cloth), make_opening_motion(TIMES[-1]), TIMES, along=along)[1]
     with elsewhere():
-        results = cloth.sensitivities(start(cloth), opening(TIMES[-1]), TIMES, along=along)[1]
+        results = cloth.sensitivities(make_perturbed_state(cloth), make_opening_motion(TIMES[-1]), TIMES, along=along)[
+            1
+        ]
     torch.testing.assert_close(results.x, known.x, rtol=0, atol=1e-7 * float(known.x.abs().max()))
 
 

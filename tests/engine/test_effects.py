@@ -2,7 +2,16 @@
 
 import pytest
 import torch
-from helpers.engine_agreement import GRADIENTS, agree, difference, layer_transposes, moving, moving_hand, noise, outcome
+from helpers.engine_agreement import (
+    GRADIENT_TOLERANCE,
+    check_agreement,
+    compute_outcome,
+    draw_noise,
+    make_moving_hand,
+    make_moving_state,
+    relative_difference,
+    sensitivity_adjoint_error,
+)
 
 import torchcloth as tc
 from torchcloth.diagnosis.causes.catalogue import list_effect_classes
@@ -30,8 +39,8 @@ def remembering(state):
 
     def aged(seed: int, value: torch.Tensor) -> torch.Tensor:
         if value.shape[-1] == 3:  # creases
-            return 5 * noise(value.shape, 40 + seed)
-        shift, share = noise(value.shape, 40 + seed).chunk(2, dim=-1)
+            return 5 * draw_noise(value.shape, 40 + seed)
+        shift, share = draw_noise(value.shape, 40 + seed).chunk(2, dim=-1)
         return torch.cat([value.chunk(2, dim=-1)[0] * (1 + 0.1 * shift), (0.5 * share).clamp(-0.9, 0.9)], dim=-1)
 
     return state._replace(memory={name: aged(k, value) for k, (name, value) in enumerate(state.memory.items())})
@@ -80,36 +89,36 @@ EFFECTS |= {e.__name__: e for e in list_effect_classes() if e not in (*BY_HAND, 
 @pytest.mark.parametrize("name", EFFECTS)
 def test_alone(name):
     cloth = sheet({"it": EFFECTS[name]()})
-    agree(cloth, {}, remembering(moving(cloth)))
+    check_agreement(cloth, {}, remembering(make_moving_state(cloth)))
 
 
 def test_standard_in_a_hand():
     cloth = sheet(standard(), {"hand": tc.boundaries.Grasp.corner("upper-left")})
-    agree(cloth, {"hand": moving_hand(0.01)}, moving(cloth))
+    check_agreement(cloth, {"hand": make_moving_hand(0.01)}, make_moving_state(cloth))
 
 
 @pytest.mark.parametrize("options", [{}, {"weft_ratio": 0.5, "curl_weft": 3.0}])
 def test_creases_where_it_is_bent_far(options):
     cloth = sheet({"crease": E.CreasingBending(1e-4, 30.0, yield_curvature=12.0, **options)})
-    state = remembering(moving(cloth))
+    state = remembering(make_moving_state(cloth))
     with torch.no_grad():
         after, _ = substep.rollout(cloth.build_model(), state, 1e-4, {}, 1)
     flowed = (after.memory["effects.crease"] != state.memory["effects.crease"]).any(-1).float().mean()
     assert 0.2 < flowed < 0.9
-    agree(cloth, {}, state)
+    check_agreement(cloth, {}, state)
 
 
 def test_bending_of_a_sheet_that_lies_folded():
     effects = {"curl": E.Bending(1e-4, curl_warp=3.0), "friction": E.BendingFriction()}
     cloth = sheet(effects)
-    state = moving(cloth)
+    state = make_moving_state(cloth)
     flat = cloth.rest_state().x
     folded = flat * torch.tensor([1.0, 0.1, 1.0]) + 0.02 * flat.flip(-1)  # seen from far off its plane
     folded[:, 1] = torch.where(flat[:, 0] > flat[:, 0].mean(), flat[:, 1], folded[:, 1])
-    state = cloth.state(folded + 1e-4 * noise(folded.shape, 9), state.v)
+    state = cloth.state(folded + 1e-4 * draw_noise(folded.shape, 9), state.v)
     stretch = effects["curl"].stencil.fit_surface(state.x).area_ratio
     assert 0 < int((stretch == 0.5).sum()) < len(stretch)
-    agree(cloth, {}, state, substeps=20)
+    check_agreement(cloth, {}, state, substeps=20)
 
 
 def test_all_together_in_a_batch():
@@ -126,7 +135,7 @@ def test_all_together_in_a_batch():
         "shrunk": E.RestShape(0.02 * batch),
     }
     cloth = sheet(effects)
-    agree(cloth, {}, remembering(moving(cloth, (2,))))
+    check_agreement(cloth, {}, remembering(make_moving_state(cloth, (2,))))
 
 
 @pytest.mark.parametrize("air", [False, True], ids=["vacuum", "air"])
@@ -142,7 +151,7 @@ def test_viscous_forces_in_stages(stages, air):
     cloth = sheet(
         effects | ({"mass": E.AddedMass(0.1)} if air else {}), {"hand": tc.boundaries.Grasp.corner("upper-left")}
     )
-    agree(cloth, {"hand": moving_hand(0.01)}, moving(cloth), stages=stages)
+    check_agreement(cloth, {"hand": make_moving_hand(0.01)}, make_moving_state(cloth), stages=stages)
 
 
 @pytest.mark.parametrize("viscosity", [1.0, 30.0])
@@ -150,10 +159,10 @@ def test_tangents_of_a_step_that_has_stages(viscosity):
     """Coefficients of what acts in stages have other places in the program than where everything acts at once."""
     effects = {**standard(), "viscous": E.KelvinVoigt(viscosity), "elastic": E.Bending(1e-5)}
     cloth = sheet(effects, {"hand": tc.boundaries.Grasp.corner("upper-left")})
-    state, dt = moving(cloth), cloth.stable_step()
-    motion = {"hand": moving_hand(20 * dt)}
+    state, dt = make_moving_state(cloth), cloth.stable_step()
+    motion = {"hand": make_moving_hand(20 * dt)}
     assert cloth.schedule(state, motion, (0.0, 10 * dt), None).model.stages > 1
-    assert layer_transposes(cloth, motion, state, 10, dt) < GRADIENTS
+    assert sensitivity_adjoint_error(cloth, motion, state, 10, dt) < GRADIENT_TOLERANCE
 
 
 def test_an_effect_of_ones_own_that_is_viscous_in_stages_is_for_the_reference():
@@ -162,15 +171,15 @@ def test_an_effect_of_ones_own_that_is_viscous_in_stages_is_for_the_reference():
 
     custom, known = sheet({"it": Thicker(5.0)}), sheet({"it": E.KelvinVoigt(5.0)})
     assert "'it' (Thicker), which is viscous in stages" in custom.engine_in_use
-    state = moving(known)
+    state = make_moving_state(known)
     with torch.no_grad():
         one, other = (cloth(state, times=[0.0, 0.01]).x[-1] - state.x for cloth in (custom, known))
-    assert difference(one, other) < 1e-10
+    assert relative_difference(one, other) < 1e-10
     assert known.engine_in_use == "fused"
 
 
 def test_no_air_that_moves_along_changes_nothing_bitwise():
-    state = moving(sheet({}))
+    state = make_moving_state(sheet({}))
     with_none, _ = fused.rollout(sheet({"air": E.AddedMass(0.0)}).build_model(), state, 1e-4, {}, 50)
     without, _ = fused.rollout(sheet({}).build_model(), state, 1e-4, {}, 50)
     assert torch.equal(with_none.x, without.x)
@@ -180,23 +189,23 @@ def test_no_air_that_moves_along_changes_nothing_bitwise():
 def test_memory_that_nobody_owns():
     cloth = sheet({"friction": E.BendingFriction()})
     with pytest.raises(UnsupportedPart, match="friction"):
-        fused.rollout(sheet({}).build_model(), moving(cloth), 1e-4, {}, 1)
+        fused.rollout(sheet({}).build_model(), make_moving_state(cloth), 1e-4, {}, 1)
 
 
 def test_friction_that_hardly_moves():
     """By less than 1e-4 thresholds in a step, where the law is a series."""
     cloth = sheet({"bending": E.BendingFriction(1e-3, threshold=3.0), "shear": E.ShearFriction(5.0, threshold=0.02)})
-    slow = remembering(cloth.state(cloth.rest_state().x, 1e-5 * moving(cloth).v))
+    slow = remembering(cloth.state(cloth.rest_state().x, 1e-5 * make_moving_state(cloth).v))
     for name, value in slow.memory.items():  # not where the law has its kink
-        value[:, : value.shape[-1] // 2] = 1e-6 * noise(value.chunk(2, dim=-1)[0].shape, 50 + len(name))
-    agree(cloth, {}, slow, substeps=10)
+        value[:, : value.shape[-1] // 2] = 1e-6 * draw_noise(value.chunk(2, dim=-1)[0].shape, 50 + len(name))
+    check_agreement(cloth, {}, slow, substeps=10)
 
 
 def test_still_and_flat_has_finite_gradients():
     effects = {"friction": E.BendingFriction(), "shear": E.ShearFriction(), "crease": E.CreasingBending(1e-4)}
     effects |= {"air": E.AirDrag(1.2, tangential=0.1), "saturating": E.SaturatingBending(), "mass": E.AddedMass()}
     cloth = sheet(effects)
-    results = outcome(fused.rollout, cloth, {}, cloth.rest_state(), 3, 1e-4)
+    results = compute_outcome(fused.rollout, cloth, {}, cloth.rest_state(), 3, 1e-4)
     assert all(bool(torch.isfinite(grad).all()) for grad in results.gradients.values() if grad is not None)
 
 
@@ -206,12 +215,12 @@ def test_float32_gradients_over_a_thousand_steps(name):
         return sheet(standard() if name == "standard" else {**standard(), "it": EFFECTS[name]()})
 
     cloth = made()
-    state = moving(cloth, strain=0.01)
+    state = make_moving_state(cloth, strain=0.01)
     state = state.map(lambda t: t.float().double())
-    exact = outcome(substep.rollout, cloth, {}, state, 1000, 5e-5)
+    exact = compute_outcome(substep.rollout, cloth, {}, state, 1000, 5e-5)
     torch.set_default_dtype(torch.float32)
     rough = made()
-    results = outcome(fused.rollout, rough, {}, state.map(torch.Tensor.float), 1000, 5e-5)
+    results = compute_outcome(fused.rollout, rough, {}, state.map(torch.Tensor.float), 1000, 5e-5)
     for key, want in exact.gradients.items():
         if want is not None:
             got = results.gradients[key].double()
@@ -226,7 +235,7 @@ def test_an_effect_of_ones_own_is_not_taken_for_the_built_in():
 
     cloth = sheet({"g": Heavier()})
     with pytest.raises(UnsupportedPart, match="'g' \\(Heavier\\)"):
-        lower(cloth.build_model(), moving(cloth), {})
+        lower(cloth.build_model(), make_moving_state(cloth), {})
 
 
 def test_settling():
@@ -234,7 +243,7 @@ def test_settling():
     model = cloth.build_model()
     settling = E.MassDamping(30.0)
     model = model._replace(effects={**model.effects, "settling": (settling, settling.coefficients().detach())})
-    state = moving(cloth)
+    state = make_moving_state(cloth)
     one, _ = substep.rollout(model, state, 1e-4, {}, 20)
     other, _ = fused.rollout(model, state, 1e-4, {}, 20)
-    assert difference(other.x - state.x, one.x - state.x) < 1e-10
+    assert relative_difference(other.x - state.x, one.x - state.x) < 1e-10

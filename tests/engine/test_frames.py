@@ -2,7 +2,7 @@
 
 import pytest
 import torch
-from helpers.engine_cloths import opening, sheet, start
+from helpers.engine_cloths import make_opening_motion, make_perturbed_state, make_sheet
 
 import torchcloth as tc
 from torchcloth.engine import execution
@@ -25,17 +25,17 @@ def slipping():
         "friction": tc.effects.ShearFriction(1.0),
         "bending": tc.effects.Bending(1e-4, damping_time=1e-3),
     }
-    return sheet("fused", effects=effects)
+    return make_sheet("fused", effects=effects)
 
 
-@pytest.mark.parametrize("make", [lambda: sheet("fused"), slipping], ids=["plain", "slipping"])
+@pytest.mark.parametrize("make", [lambda: make_sheet("fused"), slipping], ids=["plain", "slipping"])
 @pytest.mark.parametrize("batch", [(), (3,), (2, 2)], ids=str)
 def test_frames_together_are_frames_one_by_one(make, batch, monkeypatch):
     cloth = make()
     with torch.no_grad():
-        together = cloth(start(cloth, batch), opening(END), UNEVEN)
+        together = cloth(make_perturbed_state(cloth, batch), make_opening_motion(END), UNEVEN)
         one_by_one(monkeypatch)
-        apart = cloth(start(cloth, batch), opening(END), UNEVEN)
+        apart = cloth(make_perturbed_state(cloth, batch), make_opening_motion(END), UNEVEN)
     assert torch.equal(together.x, apart.x)
     assert torch.equal(together.v, apart.v)
     assert together.wrench.keys() == apart.wrench.keys() == {"left", "right"}
@@ -45,7 +45,7 @@ def test_frames_together_are_frames_one_by_one(make, batch, monkeypatch):
 
 
 def test_long_simulations_are_cut_into_calls(monkeypatch):
-    cloth, calls = sheet("fused"), []
+    cloth, calls = make_sheet("fused"), []
     forward = execution.forward
     monkeypatch.setattr(
         execution,
@@ -53,10 +53,10 @@ def test_long_simulations_are_cut_into_calls(monkeypatch):
         lambda job, record_interval=0: calls.append(job.frame_ends) or forward(job, record_interval),
     )
     with torch.no_grad():
-        whole = cloth(start(cloth), opening(END), UNEVEN)
+        whole = cloth(make_perturbed_state(cloth), make_opening_motion(END), UNEVEN)
         assert len(calls) == 1
         monkeypatch.setattr(rollout, "MAX_VERTEX_SUBSTEPS_PER_CALL", 2 * calls[0][0] * rollout.MIN_COUNTED_VERTICES)
-        cut = cloth(start(cloth), opening(END), UNEVEN)
+        cut = cloth(make_perturbed_state(cloth), make_opening_motion(END), UNEVEN)
     assert 1 < len(calls[1:]) < len(UNEVEN)
     assert torch.equal(whole.x, cut.x)
     assert all(torch.equal(whole.wrench[name], cut.wrench[name]) for name in whole.wrench)
@@ -64,44 +64,44 @@ def test_long_simulations_are_cut_into_calls(monkeypatch):
 
 @pytest.mark.parametrize("wanted", ["cloth", "t", "pose"])
 def test_who_wants_gradients_gets_them_and_the_same_frames(wanted):
-    cloth, motion = sheet("fused"), opening(END)
+    cloth, motion = make_sheet("fused"), make_opening_motion(END)
     with torch.no_grad():
-        together = cloth(start(cloth), motion, UNEVEN)
+        together = cloth(make_perturbed_state(cloth), motion, UNEVEN)
     if wanted != "cloth":
         cloth.requires_grad_(False)
         leaf = getattr(motion["left"], wanted).clone().requires_grad_()
         motion["left"] = motion["left"]._replace(**{wanted: leaf})
-    apart = cloth(start(cloth), motion, UNEVEN)
+    apart = cloth(make_perturbed_state(cloth), motion, UNEVEN)
     assert apart.x.requires_grad
     assert torch.equal(together.x, apart.x)
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_nobody_prescribed_it(dtype, monkeypatch):
-    cloth = sheet("fused", boundaries={}).to(dtype)
+    cloth = make_sheet("fused", boundaries={}).to(dtype)
     with torch.no_grad():
-        together = cloth(start(cloth), times=UNEVEN)
+        together = cloth(make_perturbed_state(cloth), times=UNEVEN)
         one_by_one(monkeypatch)
-        apart = cloth(start(cloth), times=UNEVEN)
+        apart = cloth(make_perturbed_state(cloth), times=UNEVEN)
     assert together.x.dtype == dtype
     assert torch.equal(together.x, apart.x)
 
 
 def test_who_keeps_the_last_state_keeps_no_other_frames():
-    cloth = sheet("fused")
+    cloth = make_sheet("fused")
     with torch.no_grad():
-        last = cloth(start(cloth), opening(END), UNEVEN).state
+        last = cloth(make_perturbed_state(cloth), make_opening_motion(END), UNEVEN).state
     assert last.x.untyped_storage().nbytes() == last.x.numel() * last.x.element_size()
 
 
 def test_a_cloth_that_is_lost_is_told_alike(monkeypatch):
-    cloth = sheet("fused", material=tc.materials.AEP(1e5, 0.3))
-    torn, messages = start(cloth), []
+    cloth = make_sheet("fused", material=tc.materials.AEP(1e5, 0.3))
+    torn, messages = make_perturbed_state(cloth), []
     torn = torn._replace(v=torn.v * 1e155)  # its square overflows
     for apart in (False, True):
         if apart:
             one_by_one(monkeypatch)
         with torch.no_grad(), pytest.raises(SimulationDiverged) as error:
-            cloth(torn, opening(END), UNEVEN)
+            cloth(torn, make_opening_motion(END), UNEVEN)
         messages.append(str(error.value))
     assert messages[0] == messages[1]

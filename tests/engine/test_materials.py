@@ -2,7 +2,7 @@
 
 import pytest
 import torch
-from helpers.engine_agreement import agree, moving, noise
+from helpers.engine_agreement import check_agreement, draw_noise, make_moving_state
 
 import torchcloth as tc
 from torchcloth.engine.builder import UnsupportedPart
@@ -29,7 +29,7 @@ def orthotropic(plastic=None):
 def with_set(state, strain=0.02):
     """A sheet that has set before."""
     inelastic = state.memory["material"]
-    memory = {**state.memory, "material": inelastic + strain * noise(inelastic.shape, 20)}
+    memory = {**state.memory, "material": inelastic + strain * draw_noise(inelastic.shape, 20)}
     return state._replace(memory=memory)
 
 
@@ -40,22 +40,22 @@ def growth():
 @pytest.mark.parametrize("convention", ["plane_stress", "paper"])
 def test_isotropic(convention):
     cloth = sheet(tc.materials.AEP(field(5e4, 7e4), field(0.2, 0.4), convention=convention))
-    agree(cloth, {}, moving(cloth))
+    check_agreement(cloth, {}, make_moving_state(cloth))
 
 
 def test_stiffening():
     cloth = sheet(tc.materials.StiffeningAEP(field(5e4, 7e4), field(0.2, 0.4), field(0, 30), stiffening_reach=REACH))
-    agree(cloth, {}, moving(cloth, strain=0.03))
+    check_agreement(cloth, {}, make_moving_state(cloth, strain=0.03))
 
 
 def test_orthotropic_in_all_its_branches():
     cloth = sheet(orthotropic())
-    state = moving(cloth, strain=0.03)
+    state = make_moving_state(cloth, strain=0.03)
     s = tc.dynamics.surface(cloth.build_model().geometry, state.x, state.v)
     strain = torch.cat([s.f1, s.f2]).norm(dim=-1) - 1
     parts = (strain < 0, (strain > 0) & (strain < REACH), strain > REACH)
     assert all(int(part.sum()) > 5 for part in parts)
-    agree(cloth, {}, state)
+    check_agreement(cloth, {}, state)
 
 
 @pytest.mark.parametrize("law", ["isotropic", "orthotropic"])
@@ -64,24 +64,24 @@ def test_sets_and_grown(law, grown):
     plastic = tc.materials.NormYield(field(0.03, 0.3))
     material = orthotropic(plastic) if law == "orthotropic" else tc.materials.AEP(6e4, 0.3, plastic=plastic)
     cloth = sheet(material, growth() if grown else None)
-    state = with_set(moving(cloth, strain=0.1))
+    state = with_set(make_moving_state(cloth, strain=0.1))
     with torch.no_grad():
         after, _ = tc.dynamics.rollout(cloth.build_model(), state, 1e-4, {}, 1)
     flowed = (after.memory["material"] != state.memory["material"]).any(-1).float().mean()
     assert 0.2 < flowed < 0.9
-    agree(cloth, {}, state)
+    check_agreement(cloth, {}, state)
 
 
 def test_grown():
     cloth = sheet(orthotropic(), growth())
-    agree(cloth, {}, moving(cloth))
+    check_agreement(cloth, {}, make_moving_state(cloth))
 
 
 def test_batch_of_parameters_and_states():
     plastic = tc.materials.NormYield(torch.tensor([[0.03], [0.1]]))
     material = tc.materials.AEP(torch.tensor([[5e4], [7e4]]), 0.3, plastic=plastic)
     cloth = sheet(material, {"shrunk": tc.effects.RestShape(torch.tensor([[0.01], [0.03]]))})
-    agree(cloth, {}, with_set(moving(cloth, (2,), strain=0.1)))
+    check_agreement(cloth, {}, with_set(make_moving_state(cloth, (2,), strain=0.1)))
 
 
 def test_a_law_of_ones_own_is_not_taken_for_the_built_in():
@@ -96,4 +96,4 @@ def test_a_law_of_ones_own_is_not_taken_for_the_built_in():
     for material in (Own(6e4), tc.materials.AEP(6e4, plastic=OwnYield(0.1))):
         cloth = sheet(material)
         with pytest.raises(UnsupportedPart, match="Own"):
-            lower(cloth.build_model(), moving(cloth), {})
+            lower(cloth.build_model(), make_moving_state(cloth), {})

@@ -3,7 +3,7 @@
 import pytest
 import torch
 import torch.autograd.forward_ad as forward_ad
-from helpers.engine_cloths import close, opening, sheet, start
+from helpers.engine_cloths import check_close, make_opening_motion, make_perturbed_state, make_sheet
 from torch.func import functional_call, hessian, jacfwd, jacrev, jvp, vjp, vmap
 
 import torchcloth as tc
@@ -24,8 +24,8 @@ def call(request):
 
 
 def program(dtype, batch=()):
-    cloth = sheet("fused").to(dtype)
-    state = start(cloth, batch)
+    cloth = make_sheet("fused").to(dtype)
+    state = make_perturbed_state(cloth, batch)
     model = cloth.build_model()
     prescribed = stationary_prescribed(model, STEPS)
     job = FusedEngine(model, state, prescribed).job(state, torch.full((STEPS,), 1e-4), prescribed)
@@ -109,7 +109,7 @@ def test_no_order_of_modes_drops_the_curvature(second):
     def loss(raw):
         return functional_call(cloth, {name: raw}, (state, {}, [0, 0.01]), {"checkpoint": False}).x[-1].square().sum()
 
-    close(jacfwd(loss)(raw), jacrev(loss)(raw), 1e-8, "slope")
+    check_close(jacfwd(loss)(raw), jacrev(loss)(raw), 1e-8, "slope")
     with pytest.raises(InvalidInput, match="second derivatives"):
         second(loss, raw)
 
@@ -127,7 +127,7 @@ def test_a_jacobian_is_one_call_with_many_directions():
     mine = inputs[1].clone().requires_grad_()
     out = Rollout.apply(known.number, STEPS, 1, inputs[0], mine, *inputs[2:])[0][0, :3].flatten()
     backward = torch.stack([torch.autograd.grad(value, mine, retain_graph=True)[0] for value in out])
-    close(forward, backward, 1e-10, "jacobian")
+    check_close(forward, backward, 1e-10, "jacobian")
 
 
 @pytest.mark.parametrize("mapped", [(0,), (0, 1), (3,)], ids=str)
@@ -156,7 +156,7 @@ def test_vmap_equals_a_loop(mapped):
         if not isinstance(together, tuple):
             together, alone = (together,), [(a,) for a in alone]
         for part, single in zip(together, zip(*alone, strict=True), strict=True):
-            close(part, torch.stack(single), 1e-10, function.__name__)
+            check_close(part, torch.stack(single), 1e-10, function.__name__)
 
 
 def test_what_is_too_short_is_not_read_beyond():
@@ -182,12 +182,12 @@ def test_vmap_over_scenes_that_share_a_parameter():
         )
         return back(out)[0]
 
-    close(vmap(slope)(many), torch.stack([slope(x) for x in many]), 1e-10, "gradient")
+    check_close(vmap(slope)(many), torch.stack([slope(x) for x in many]), 1e-10, "gradient")
 
 
 def simulation(cloth, motion):
     values = {name: p.detach() for name, p in cloth.named_parameters()}
-    state = start(cloth)
+    state = make_perturbed_state(cloth)
 
     def run(x=state.x, pose=motion["left"].pose, **moved):
         driven = {**motion, "left": motion["left"]._replace(pose=pose)}
@@ -201,8 +201,8 @@ def simulation(cloth, motion):
 
 def test_sweep_over_a_rollout():
     """Central differences of a whole simulation in which a grasp opens and closes."""
-    cloth = sheet("fused")
-    run, state = simulation(cloth, opening(END))
+    cloth = make_sheet("fused")
+    run, state = simulation(cloth, make_opening_motion(END))
     young, drag = (cloth.get_parameter(n).detach() for n in ("material.youngs_modulus.raw", "effects.air.normal.raw"))
 
     def moved(dx, **parameters):
@@ -222,9 +222,9 @@ def test_sweep_over_a_rollout():
 @pytest.mark.parametrize("way", ["forward_ad", "torch.func.jvp"])
 def test_forward_mode_through_a_cloth(way):
     """Against the reference, and against a gradient."""
-    motion, results = opening(END), []
+    motion, results = make_opening_motion(END), []
     for engine in ("fused", "reference"):
-        run, state = simulation(sheet(engine), motion)
+        run, state = simulation(make_sheet(engine), motion)
         torch.manual_seed(0)
         dx, shift = 1e-3 * torch.randn_like(state.x), torch.zeros_like(motion["left"].pose)
         shift[:, :3, 3] = 1e-2 * torch.randn(7, 3)
@@ -234,12 +234,12 @@ def test_forward_mode_through_a_cloth(way):
                 results.append(forward_ad.unpack_dual(run(*pair)).tangent.clone())
         else:
             results.append(jvp(run, (state.x, motion["left"].pose), (dx, shift))[1])
-    close(*results, 1e-8, "tangent")
+    check_close(*results, 1e-8, "tangent")
 
 
 def test_jvp_of_a_number_of_steps_in_one_program():
     """Programs are shared: a second cloth with the same numbers, or new values of parameters, builds nothing."""
-    first, second = sheet("fused"), sheet("fused")
+    first, second = make_sheet("fused"), make_sheet("fused")
     with torch.no_grad():
         second.material.youngs_modulus.set(2e5)
     numbers = set()
@@ -260,9 +260,9 @@ def test_a_program_that_nobody_holds():
 
 def test_state_of_another_precision():
     """A parameter that was given in float64 to a cloth in float32 is cast, forward and backward."""
-    cloth = sheet("fused").float()
+    cloth = make_sheet("fused").float()
     cloth.areal_density = tc.PhysicalParameter(torch.tensor(0.2, dtype=torch.float64), "kg/m^2")
-    out = cloth(start(cloth), opening(END), (0.0, 0.004))
+    out = cloth(make_perturbed_state(cloth), make_opening_motion(END), (0.0, 0.004))
     assert out.x.dtype == torch.float32
     out.x.sum().backward()
     assert cloth.areal_density.raw.grad.dtype == torch.float64

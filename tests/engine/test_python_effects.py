@@ -3,7 +3,7 @@
 import pytest
 import torch
 import torch.autograd.forward_ad as forward_ad
-from helpers.engine_cloths import close, opening, sheet, start
+from helpers.engine_cloths import check_close, make_opening_motion, make_perturbed_state, make_sheet
 
 import torchcloth as tc
 from torchcloth.effects import AbstractEffect, Amplitude
@@ -87,16 +87,16 @@ class Softening(tc.materials.AEP):
 def cloth_with(engine, part):
     effects = {"gravity": tc.effects.Gravity(), "air": tc.effects.AirDrag(1.2), "bending": tc.effects.Bending(1e-4)}
     if part == "material":
-        return sheet(engine, effects=effects, material=Softening(1e5, 0.3))
+        return make_sheet(engine, effects=effects, material=Softening(1e5, 0.3))
     if part == "both":
-        return sheet(engine, effects={**effects, "own": Fading(0.02)}, material=Softening(1e5, 0.3))
-    return sheet(engine, effects={**effects, "own": part(0.02)})
+        return make_sheet(engine, effects={**effects, "own": Fading(0.02)}, material=Softening(1e5, 0.3))
+    return make_sheet(engine, effects={**effects, "own": part(0.02)})
 
 
 def outcome(engine, part, batch=(), checkpoint=True):
     cloth = cloth_with(engine, part)
-    motion = opening(END)
-    state = start(cloth, batch)
+    motion = make_opening_motion(END)
+    state = make_perturbed_state(cloth, batch)
     pose = motion["left"].pose.clone().requires_grad_()
     x = state.x.clone().requires_grad_()
     motion["left"] = motion["left"]._replace(pose=pose)
@@ -116,11 +116,11 @@ def test_values_and_gradients_equal_the_reference(part, options):
     expected, slopes = outcome("reference", part, **options)
     assert parts.keys() == expected.keys()
     for name, value in parts.items():
-        close(value, expected[name], 1e-10, name)
+        check_close(value, expected[name], 1e-10, name)
     for name, grad in grads.items():
         assert (grad is None) == (slopes[name] is None), name
         if grad is not None:
-            close(grad, slopes[name], 1e-8, name)
+            check_close(grad, slopes[name], 1e-8, name)
 
 
 @pytest.mark.parametrize("part", [Fading, "both"])
@@ -129,20 +129,20 @@ def test_forward_mode(part):
     results = []
     for engine in ("fused", "reference"):
         cloth = cloth_with(engine, part)
-        state = start(cloth)
+        state = make_perturbed_state(cloth)
         torch.manual_seed(0)
         dx = 1e-3 * torch.randn(2, *state.x.shape)
         with torch.no_grad(), forward_ad.dual_level():
-            out = cloth(state._replace(x=forward_ad.make_dual(state.x, dx[0])), opening(END), TIMES)
+            out = cloth(state._replace(x=forward_ad.make_dual(state.x, dx[0])), make_opening_motion(END), TIMES)
             one = forward_ad.unpack_dual(out.x).tangent.clone()
         moved = tc.ClothState(dx, torch.zeros_like(dx), dx[..., :0, :],
                               {name: torch.zeros(2, *m.shape) for name, m in state.memory.items()})  # fmt: skip
         along = Directions({"effects.bending.stiffness.raw": torch.tensor([0.0, 1.0])}, moved)
-        _, many = cloth.sensitivities(state, opening(END), TIMES, along=along)
-        close(many.x[0], one, 1e-9, "the same direction")
+        _, many = cloth.sensitivities(state, make_opening_motion(END), TIMES, along=along)
+        check_close(many.x[0], one, 1e-9, "the same direction")
         results.append((one, many.x, many.wrench["left"]))
     for a, b in zip(*results, strict=True):
-        close(a, b, 1e-8, "tangent")
+        check_close(a, b, 1e-8, "tangent")
 
 
 def test_print_names_what_torch_computes():
@@ -161,8 +161,8 @@ def test_hooks_that_reach_into_the_substep_are_left_to_the_reference(part):
 def test_settling_and_a_grip_effect():
     """While it settles, grips do not slip: that part can then run on the engine."""
     auto, reference = (cloth_with(engine, Slippery) for engine in ("auto", "reference"))
-    a, b = (c.settle(start(c), opening(END), duration=0.01) for c in (auto, reference))
-    close(a.x, b.x, 1e-10, "x")
+    a, b = (c.settle(make_perturbed_state(c), make_opening_motion(END), duration=0.01) for c in (auto, reference))
+    check_close(a.x, b.x, 1e-10, "x")
 
 
 def test_memory_is_bounded_by_checkpoints(monkeypatch):
@@ -178,8 +178,10 @@ def test_memory_is_bounded_by_checkpoints(monkeypatch):
             return tensor
 
         with torch.autograd.graph.saved_tensors_hooks(pack, lambda t: t):
-            state = start(cloth)
-            cloth(state._replace(x=state.x.requires_grad_()), opening(0.1), (0.0, 0.1), checkpoint=checkpoint)
+            state = make_perturbed_state(cloth)
+            cloth(
+                state._replace(x=state.x.requires_grad_()), make_opening_motion(0.1), (0.0, 0.1), checkpoint=checkpoint
+            )
         return total
 
     assert saved_bytes(True) < saved_bytes(False) / 20
@@ -204,7 +206,7 @@ class Misplaced(Blow):
 def test_a_force_of_another_shape_is_refused_by_name(engine, kind):
     cloth = cloth_with(engine, kind)
     with pytest.raises(tc.errors.InvalidInput, match=r"force of effect 'own'.*a row for each of the"):
-        cloth(start(cloth), opening(END), TIMES)
+        cloth(make_perturbed_state(cloth), make_opening_motion(END), TIMES)
 
 
 def test_batched_poses_without_gradient_and_their_divergence():
@@ -239,11 +241,11 @@ class Even(Pull):
 def test_a_force_on_triangles_may_be_that_of_all_scenes():
     results = []
     for engine in ("reference", "fused"):
-        cloth = sheet(effects={"even": Even()}, boundaries={})
+        cloth = make_sheet(effects={"even": Even()}, boundaries={})
         cloth.engine = engine
-        state = cloth.state(start(cloth).x.expand(2, -1, -1).clone())
+        state = cloth.state(make_perturbed_state(cloth).x.expand(2, -1, -1).clone())
         results.append(cloth(state, times=(0.0, 0.01)).x)
-    close(results[1], results[0], 1e-10, "positions")
+    check_close(results[1], results[0], 1e-10, "positions")
 
 
 class Mixing(Pull):
@@ -269,28 +271,28 @@ class Listed(Pull):
 
 def test_a_plain_matrix_has_slopes_of_one_scene_and_is_refused_of_several():
     cloth = cloth_with("auto", Mixing)
-    state = start(cloth)
+    state = make_perturbed_state(cloth)
     torch.manual_seed(0)
     direction = torch.randn(2, 3, 3)
     along = Directions({"effects.own.matrix": direction})
-    moved = cloth.sensitivities(state, opening(END), TIMES, along=along)[1].x[0]
+    moved = cloth.sensitivities(state, make_opening_motion(END), TIMES, along=along)[1].x[0]
     with torch.no_grad():
         ends = []
         for sign in (1, -1):
             cloth.effects["own"].matrix.copy_(torch.eye(3) + sign * 1e-3 * direction[0])
-            ends.append(cloth(state, opening(END), TIMES).x)
-    close(moved, (ends[0] - ends[1]) / 2e-3, 1e-6, "slope")
+            ends.append(cloth(state, make_opening_motion(END), TIMES).x)
+    check_close(moved, (ends[0] - ends[1]) / 2e-3, 1e-6, "slope")
     several = state.map(lambda field: field.expand(2, *field.shape))
     with pytest.raises(
         InvalidInput, match=r"effects.own.matrix.*shape \(3, 3\), and several scenes.*PhysicalParameter"
     ):
-        cloth.sensitivities(several, opening(END), TIMES, along=along)
+        cloth.sensitivities(several, make_opening_motion(END), TIMES, along=along)
 
 
 @pytest.mark.parametrize("engine", ["auto", "reference"])
 def test_coefficients_in_a_list_may_be_batched(engine):
     cloth = cloth_with(engine, Listed)
     cloth.effects["own"].strength = tc.PhysicalParameter(torch.tensor([1e-3, 2e-3]), "N", "nonnegative", name="pull")
-    out = cloth(start(cloth), opening(END), TIMES)
+    out = cloth(make_perturbed_state(cloth), make_opening_motion(END), TIMES)
     assert out.x.shape[:2] == (2, 3)  # scenes, frames
     assert not torch.equal(out.x[0, -1], out.x[1, -1])

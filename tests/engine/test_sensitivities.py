@@ -4,7 +4,7 @@ import math
 
 import pytest
 import torch
-from helpers.engine_cloths import close, opening, sheet, start
+from helpers.engine_cloths import check_close, make_opening_motion, make_perturbed_state, make_sheet
 
 import torchcloth as tc
 from torchcloth.engine import tangents
@@ -38,8 +38,8 @@ def parts(out):
 def both(settle=0.0, batch=(), times=(0.0, 0.4 * END, END), count=3):
     results = []
     for engine in ("fused", "reference"):
-        cloth = sheet(engine)
-        state, motion = start(cloth, batch), opening(END)
+        cloth = make_sheet(engine)
+        state, motion = make_perturbed_state(cloth, batch), make_opening_motion(END)
         along = directions(cloth, state, motion, count)
         results.append(cloth.sensitivities(state, motion, times, along=along, settle=settle))
     return results
@@ -49,8 +49,8 @@ def both(settle=0.0, batch=(), times=(0.0, 0.4 * END, END), count=3):
 def test_equal_the_reference(case):
     (value, moved), (expected, slopes) = both(**case)
     for name in parts(value):
-        close(parts(value)[name], parts(expected)[name], 1e-10, name)
-        close(parts(moved)[name], parts(slopes)[name], 1e-8, f"tangent of {name}")
+        check_close(parts(value)[name], parts(expected)[name], 1e-10, name)
+        check_close(parts(moved)[name], parts(slopes)[name], 1e-8, f"tangent of {name}")
     count = case.get("count", 3)
     assert moved.x.shape == (count, *value.x.shape)
 
@@ -60,20 +60,20 @@ def test_cloth_that_sets_while_it_settles_and_hands_are_moved():
     results = []
     for engine in ("fused", "reference"):
         material = tc.materials.AEP(1e5, 0.3, plastic=tc.materials.NormYield(1e-3))
-        cloth = sheet(engine, material=material)
-        state, motion = start(cloth), opening(END)
+        cloth = make_sheet(engine, material=material)
+        state, motion = make_perturbed_state(cloth), make_opening_motion(END)
         moves = directions(cloth, state, motion).motion
         results.append(cloth.sensitivities(state, motion, (0.0, END), along=Directions(motion=moves), settle=0.2))
     (value, moved), (expected, slopes) = results
     for name in parts(value):
-        close(parts(value)[name], parts(expected)[name], 1e-10, name)
-        close(parts(moved)[name], parts(slopes)[name], 1e-7, f"tangent of {name}")
+        check_close(parts(value)[name], parts(expected)[name], 1e-10, name)
+        check_close(parts(moved)[name], parts(slopes)[name], 1e-7, f"tangent of {name}")
 
 
 def test_equal_reverse_mode():
     """Every direction against the same projection of a gradient."""
-    cloth = sheet("fused")
-    state, motion, times = start(cloth), opening(END), (0.0, 0.005, END)
+    cloth = make_sheet("fused")
+    state, motion, times = make_perturbed_state(cloth), make_opening_motion(END), (0.0, 0.005, END)
     along = directions(cloth, state, motion)
     _, moved = cloth.sensitivities(state, motion, times, along=along)
     leaves = {name: t.pose.clone().requires_grad_() for name, t in motion.items()}
@@ -93,8 +93,8 @@ def test_equal_reverse_mode():
 
 def test_directions_that_leave_the_parameters_alone():
     """Beside others that change them: each is what it would be by itself."""
-    cloth = sheet("fused")
-    state, motion, times = start(cloth), opening(END), (0.0, END)
+    cloth = make_sheet("fused")
+    state, motion, times = make_perturbed_state(cloth), make_opening_motion(END), (0.0, END)
     along = directions(cloth, state, motion)
     some = {name: tangent.clone() for name, tangent in along.parameters.items()}
     for tangent in some.values():
@@ -104,7 +104,7 @@ def test_directions_that_leave_the_parameters_alone():
     _, without = cloth.sensitivities(state, motion, times, along=along._replace(parameters={}))
     for name in parts(mixed):
         torch.testing.assert_close(parts(mixed)[name][[0, 2]], parts(whole)[name][[0, 2]], rtol=0, atol=0)
-        close(parts(mixed)[name][1], parts(without)[name][1], 1e-12, name)
+        check_close(parts(mixed)[name][1], parts(without)[name][1], 1e-12, name)
 
 
 def test_fields_and_boundary_free_cloth():
@@ -112,11 +112,11 @@ def test_fields_and_boundary_free_cloth():
     results = []
     for engine in ("fused", "reference"):
         field = torch.linspace(0.9e5, 1.1e5, 32)
-        cloth = sheet(engine, material=tc.materials.AEP(field, 0.3), boundaries={})
+        cloth = make_sheet(engine, material=tc.materials.AEP(field, 0.3), boundaries={})
         raw = torch.randn(2, 32, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
         along = Directions({"material.youngs_modulus.raw": raw})
-        results.append(cloth.sensitivities(start(cloth), None, (0.0, 0.01), along=along)[1].x)
-    close(*results, 1e-8, "tangent")
+        results.append(cloth.sensitivities(make_perturbed_state(cloth), None, (0.0, 0.01), along=along)[1].x)
+    check_close(*results, 1e-8, "tangent")
     assert float(results[0][:, 1].abs().max()) > 0
 
 
@@ -124,11 +124,13 @@ def test_one_hand_of_two():
     """The other's poses stay as they are."""
     results = []
     for engine in ("fused", "reference"):
-        cloth = sheet(engine)
-        pose = directions(cloth, start(cloth), opening(END)).motion["right"]
+        cloth = make_sheet(engine)
+        pose = directions(cloth, make_perturbed_state(cloth), make_opening_motion(END)).motion["right"]
         along = Directions(motion={"right": pose})
-        results.append(cloth.sensitivities(start(cloth), opening(END), (0.0, END), along=along)[1].x)
-    close(*results, 1e-8, "tangent")
+        results.append(
+            cloth.sensitivities(make_perturbed_state(cloth), make_opening_motion(END), (0.0, END), along=along)[1].x
+        )
+    check_close(*results, 1e-8, "tangent")
 
 
 @pytest.mark.parametrize("engine", ["auto", "reference"])
@@ -160,15 +162,15 @@ def test_one_hand_of_two():
     ],
 )
 def test_refusals(engine, along, message):
-    cloth = sheet(engine)
+    cloth = make_sheet(engine)
     with pytest.raises(InvalidInput, match=message):
-        cloth.sensitivities(cloth.rest_state(), opening(END), (0.0, END), along=along)
+        cloth.sensitivities(cloth.rest_state(), make_opening_motion(END), (0.0, END), along=along)
 
 
 def test_without_gradients_and_graph():
-    cloth = sheet("fused")
+    cloth = make_sheet("fused")
     along = Directions({"areal_density.raw": torch.ones(1)})
-    value, moved = cloth.sensitivities(start(cloth), opening(END), (0.0, 0.005), along=along)
+    value, moved = cloth.sensitivities(make_perturbed_state(cloth), make_opening_motion(END), (0.0, 0.005), along=along)
     assert not value.x.requires_grad
     assert not moved.x.requires_grad
 
@@ -182,11 +184,11 @@ def test_all_directions_share_one_look_at_the_parts(monkeypatch):
 
 
 def test_what_is_refused_is_the_simulations_business_first():
-    cloth = sheet("fused")
-    along = Directions({"areal_density.raw": torch.ones(1)}, state=start(cloth))
+    cloth = make_sheet("fused")
+    along = Directions({"areal_density.raw": torch.ones(1)}, state=make_perturbed_state(cloth))
     for state, motion, message in (
-        (start(cloth), [opening(END)], "motion; got list; expected a dict"),
-        (start(cloth).x, opening(END), "state; got Tensor; expected a ClothState"),
+        (make_perturbed_state(cloth), [make_opening_motion(END)], "motion; got list; expected a dict"),
+        (make_perturbed_state(cloth).x, make_opening_motion(END), "state; got Tensor; expected a ClothState"),
     ):
         with pytest.raises(InvalidInput, match=message):
             cloth.sensitivities(state, motion, (0.0, END), along=along)

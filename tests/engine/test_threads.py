@@ -7,8 +7,8 @@ import sys
 
 import pytest
 import torch
-from helpers.engine_agreement import agree, moving, moving_hand
-from helpers.engine_cloths import opening, sheet, start
+from helpers.engine_agreement import check_agreement, make_moving_hand, make_moving_state
+from helpers.engine_cloths import make_opening_motion, make_perturbed_state, make_sheet
 
 import torchcloth as tc
 from torchcloth.engine import execution
@@ -73,16 +73,16 @@ def test_tangents(cloth, threads, count):
 @pytest.mark.usefixtures("team")
 def test_a_team_agrees_with_the_reference():
     """With contact: test_contact.py."""
-    cloth = sheet(n=9)
-    agree(cloth, {"left": moving_hand(0.01), "right": moving_hand(0.01)}, moving(cloth))
+    cloth = make_sheet(n=9)
+    check_agreement(cloth, {"left": make_moving_hand(0.01), "right": make_moving_hand(0.01)}, make_moving_state(cloth))
 
 
 @pytest.mark.usefixtures("team")
 @pytest.mark.parametrize("contact", [None, tc.Contact(everywhere=True)])
 def test_a_team_repeats_itself_bit_by_bit(contact):
     """Of 300 substeps it does some together and some alone."""
-    cloth = sheet(n=9, contact=contact)
-    state, motion = start(cloth), opening(0.03)
+    cloth = make_sheet(n=9, contact=contact)
+    state, motion = make_perturbed_state(cloth), make_opening_motion(0.03)
     runs = [_all(cloth, state, motion) for _ in range(3)]
     assert all(torch.equal(a, b) for other in runs[1:] for a, b in zip(runs[0], other, strict=True))
 
@@ -90,8 +90,8 @@ def test_a_team_repeats_itself_bit_by_bit(contact):
 @pytest.mark.skipif(not os.path.exists("/proc/self/task"), reason="needs Linux to count threads")
 @pytest.mark.usefixtures("team")
 def test_helpers_stay_for_the_next_call_and_a_fork_does_without_them():
-    cloth = sheet(n=9)
-    state, motion = start(cloth), opening(0.03)
+    cloth = make_sheet(n=9)
+    state, motion = make_perturbed_state(cloth), make_opening_motion(0.03)
 
     def run() -> torch.Tensor:
         with torch.no_grad():
@@ -146,8 +146,8 @@ def _all(cloth, state, motion) -> list[torch.Tensor]:
 
 @pytest.mark.parametrize("contact", [None, tc.Contact(everywhere=True)])
 def test_threads_change_what_a_scene_does_by_rounding_only(contact, monkeypatch):
-    cloth = sheet(n=9, contact=contact)
-    state, motion = start(cloth), opening(0.03)
+    cloth = make_sheet(n=9, contact=contact)
+    state, motion = make_perturbed_state(cloth), make_opening_motion(0.03)
     results = []
     for threads in (1, 2):
         monkeypatch.setattr(execution, "MIN_OPS_PER_THREAD", 1e-9)

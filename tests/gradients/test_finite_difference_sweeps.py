@@ -5,7 +5,7 @@ The mark is the project's; sweeps reach 1e-8 to 1e-10 here, where truncation (h^
 
 import pytest
 import torch
-from helpers.gradient_scenes import STEPS, parameters, simulate, sizes
+from helpers.gradient_scenes import STEP_SIZES, active_parameters, simulate, step_scales
 
 import torchcloth as tc
 from torchcloth.testing import check_gradients
@@ -18,7 +18,7 @@ def states(out):
 
 
 def sweep_parameters(scene, names, mark=MARK, read=states):
-    values = parameters(scene.cloth)
+    values = active_parameters(scene.cloth)
     assert set(names) <= set(values), sorted(values)
 
     def run(**moved):
@@ -26,7 +26,7 @@ def sweep_parameters(scene, names, mark=MARK, read=states):
         return read(simulate(scene.cloth, named, scene.state, scene.motion, scene.times, dt=scene.dt))
 
     inputs = {name: values[name] for name in names}
-    return check_gradients(run, inputs, mark, STEPS, sizes=sizes(inputs))
+    return check_gradients(run, inputs, mark, STEP_SIZES, sizes=step_scales(inputs))
 
 
 SWING = [
@@ -61,7 +61,7 @@ def test_initial_state_and_gripper_pose(swing):
         out = swing.cloth(state, motion, swing.times, dt=swing.dt)
         return torch.cat([states(out).flatten(), out.wrench["hand"][1:].flatten()])
 
-    check_gradients(run, inputs, MARK, STEPS)
+    check_gradients(run, inputs, MARK, STEP_SIZES)
 
 
 PRESSED = ["youngs_modulus", "poisson_ratio", "contact_stiffness", "shear_stiffness", "cone"]
@@ -98,7 +98,7 @@ def test_initial_state_and_directors_of_a_pressed_sheet(pressed):
         state = pressed.state._replace(x=x + 0.001 * dx, v=v + 0.1 * dv, d3=d3 + 0.01 * dd)
         return directors(pressed.cloth(state, None, pressed.times, dt=pressed.dt))
 
-    check_gradients(run, inputs, MARK, STEPS)
+    check_gradients(run, inputs, MARK, STEP_SIZES)
 
 
 def test_friction_of_a_plane():
@@ -111,7 +111,7 @@ def test_friction_of_a_plane():
     dt = 0.6 * cloth.stable_step()
     torch.manual_seed(0)
     slip = torch.cat([torch.tensor([1.0, 0.3]) + 0.1 * torch.randn(16, 2), torch.zeros(16, 1)], dim=-1)
-    values = parameters(cloth)
+    values = active_parameters(cloth)
     names = ["boundaries.table.friction.raw", "effects.gravity.acceleration", "material.youngs_modulus.raw"]
 
     def run(**moved):
@@ -120,7 +120,7 @@ def test_friction_of_a_plane():
         return states(simulate(cloth, {**values, **moved}, state, {}, [0.0, 40 * dt], dt=dt))
 
     inputs = {**{name: values[name] for name in names}, "dv": torch.zeros(16, 3)}
-    check_gradients(run, inputs, MARK, STEPS, sizes=sizes(inputs))
+    check_gradients(run, inputs, MARK, STEP_SIZES, sizes=step_scales(inputs))
 
 
 def test_fields_get_a_gradient_in_every_triangle(swing):
@@ -157,7 +157,7 @@ def test_joint_angles_material_and_effects_in_one_graph():
     turn = torch.tensor([0.01, 0.02, -0.01, 0.02, 0.01, 0.02, 0.03])
     waypoints = torch.stack([arm.home, arm.home + 0.4 * turn, arm.home + turn])
     target = state.x + torch.tensor([0.05, 0.0, -0.05])
-    values = parameters(cloth)
+    values = active_parameters(cloth)
     names = ["material.youngs_modulus.raw", "effects.air.normal.raw", "effects.gravity.acceleration"]
 
     def loss(dq, **moved):
@@ -167,7 +167,7 @@ def test_joint_angles_material_and_effects_in_one_graph():
         return ((out.x[-1] - target) ** 2).sum() + 1e-3 * (out.wrench["hand"][1:] ** 2).sum()
 
     inputs = {"dq": torch.zeros_like(waypoints), **{name: values[name] for name in names}}
-    check_gradients(loss, inputs, MARK, STEPS, sizes=sizes(inputs))
+    check_gradients(loss, inputs, MARK, STEP_SIZES, sizes=step_scales(inputs))
 
     q = torch.nn.Parameter(waypoints)
     out = cloth(state, {"hand": arm.motion(q, torch.linspace(0.0, end, 3), period=0.004)}, [0.0, end], dt=dt)

@@ -5,7 +5,7 @@ from contextlib import nullcontext
 import pytest
 import torch
 import torch.autograd.forward_ad as forward_ad
-from helpers.gradient_scenes import parameters, simulate
+from helpers.gradient_scenes import active_parameters, simulate
 
 from torchcloth._utils.forward_mode import dense_tangents
 from torchcloth.testing.contract import batch_parameters, require_close, unbatch_parameters
@@ -24,7 +24,7 @@ def run(scene, values, state, motion, **options):
 
 
 def leaves_of(scene):
-    leaves = {**parameters(scene.cloth), "x": scene.state.x, "v": scene.state.v}
+    leaves = {**active_parameters(scene.cloth), "x": scene.state.x, "v": scene.state.v}
     if scene.cloth.contact is not None:
         leaves["d3"] = scene.state.d3
     return {**leaves, **{name: trajectory.pose for name, trajectory in scene.motion.items()}}
@@ -61,7 +61,7 @@ def test_real_tangents_change_nothing(scene):
     for inside in (False, True):
         with torch.no_grad(), forward_ad.dual_level():
             duals = dict(inputs)
-            for name in parameters(scene.cloth):
+            for name in active_parameters(scene.cloth):
                 duals[name] = forward_ad.make_dual(inputs[name], torch.ones_like(inputs[name]))
             with dense_tangents() if inside else nullcontext():
                 dual = evaluate(scene, duals, checkpoint=False)
@@ -91,7 +91,7 @@ def test_checkpoints_within_long_intervals(swing):
 
 def test_a_batch_equals_a_loop(scene):
     """States, poses and parameters at once, values and gradients."""
-    names = parameters(scene.cloth)
+    names = active_parameters(scene.cloth)
     many = batch_parameters(names, 3, spread=0.05)
     torch.manual_seed(0)
     fields = {name: value for name, value in leaves_of(scene).items() if name not in names}
@@ -143,7 +143,7 @@ def test_one_state_with_batched_poses_or_parameters(request, scene_name, what):
             poses[..., :3, 3] += 0.01 * torch.randn(3, 1, 3) * torch.linspace(0, 1, poses.shape[1])[:, None]
         entries = [{name: poses[k] for name, poses in many.items()} for k in range(3)]
     else:
-        names = parameters(scene.cloth)
+        names = active_parameters(scene.cloth)
         many = batch_parameters(names, 3, spread=0.05)
         entries = [unbatch_parameters(many, names, k) for k in range(3)]
     together = evaluate(scene, {**leaves, **many})

@@ -11,7 +11,7 @@ from torchcloth.dynamics import substep
 from torchcloth.types import EffectInputs
 
 
-def irregular(n, amount=0.25, size=0.3):
+def make_irregular_mesh(n, amount=0.25, size=0.3):
     """A square sheet whose inner vertices are moved by up to ``amount`` cells."""
     mesh = tc.meshes.rectangle(size, size, resolution=(n, n))
     uv = mesh.uv.copy()
@@ -21,7 +21,7 @@ def irregular(n, amount=0.25, size=0.3):
     return tc.meshes.Mesh.build(np.column_stack([uv, np.zeros(len(uv))]), mesh.faces, uv)
 
 
-def cylinder(mesh, curvature, degrees=0.0):
+def roll_to_cylinder(mesh, curvature, degrees=0.0):
     """[V, 3] m: the sheet rolled along a direction of its pattern, the centre on its normal's side if > 0."""
     a = math.radians(degrees)
     u, v = torch.as_tensor(mesh.uv).T
@@ -32,48 +32,48 @@ def cylinder(mesh, curvature, degrees=0.0):
 
 
 @cache
-def model(mesh):
+def build_bare_model(mesh):
     return tc.Cloth(mesh, tc.materials.AEP(1e3), 0.2, contact=None).build_model()
 
 
-def moment(mesh, x, memory=None, dt=0.0):
+def make_effect_inputs(mesh, x, memory=None, dt=0.0):
     """What an effect sees of the sheet at ``x``, at rest."""
-    v, bare = torch.zeros_like(x), model(mesh)
+    v, bare = torch.zeros_like(x), build_bare_model(mesh)
     return EffectInputs(x, v, substep.surface(bare.geometry, x, v), bare.mass, memory, dt)
 
 
-def through(effect, mesh, path, dt=0.0):
+def trace_memory(effect, mesh, path, dt=0.0):
     """Internal variables after each of the positions of ``path``, from a virgin sheet at the first."""
     memory = effect.initial_memory(path[0])
     found = [memory]
     for x in path[1:]:
-        memory = effect.update_memory(effect.coefficients(), moment(mesh, x, memory, dt))
+        memory = effect.update_memory(effect.coefficients(), make_effect_inputs(mesh, x, memory, dt))
         found.append(memory)
     return found
 
 
-def work(effect, mesh, path):
+def compute_work(effect, mesh, path):
     """[J] that a sheet led along ``path`` takes up, by the trapezoidal rule."""
-    memories = through(effect, mesh, path)
+    memories = trace_memory(effect, mesh, path)
     c = effect.coefficients()
-    forces = [effect.force(c, moment(mesh, x, memory)) for x, memory in zip(path, memories, strict=True)]
+    forces = [effect.force(c, make_effect_inputs(mesh, x, memory)) for x, memory in zip(path, memories, strict=True)]
     pairs = zip(forces, forces[1:], path, path[1:], strict=False)
     return -sum(0.5 * ((f0 + f1) * (x1 - x0)).sum() for f0, f1, x0, x1 in pairs).item()
 
 
-def cycles(largest, steps, count=2):
+def make_cycles(largest, steps, count=2):
     """0, up to ``largest``, down to -``largest`` and back, ``count`` times."""
     ramp = torch.linspace(-1, 1, steps + 1)
     loop = torch.cat([ramp.flip(0)[1:], ramp[1:]])
     return largest * torch.cat([torch.linspace(0, 1, steps // 2 + 1), *[loop] * count])
 
 
-def drift(effects, steps=100, seed=0):
+def measure_momentum_drift(effects, steps=100, seed=0):
     """Change of momentum and of angular momentum, relative, over a free motion with these effects."""
-    mesh = irregular(6, size=0.15)
+    mesh = make_irregular_mesh(6, size=0.15)
     cloth = tc.Cloth(mesh, tc.materials.AEP(1e3), 0.2, effects, contact=None)
     generator = torch.Generator().manual_seed(seed)
-    x = cylinder(mesh, 8.0, 30) + 5.0
+    x = roll_to_cylinder(mesh, 8.0, 30) + 5.0
     v = 0.3 * torch.randn(x.shape, generator=generator)
     with torch.no_grad():
         out = cloth(cloth.state(x, v), times=(0.0, steps * cloth.stable_step()))
@@ -85,7 +85,7 @@ def drift(effects, steps=100, seed=0):
     return ((momenta[1] - momenta[0]).norm() / scale).item(), ((turning[1] - turning[0]).norm() / far).item()
 
 
-def relative(cloth, state, times, names, effect=None):
+def make_gradient_problem(cloth, state, times, names, effect=None):
     """(function, inputs) for ``check_gradients``: the end of a motion, by start [0.1 mm] and logarithms of parameters.
 
     Laws with kinks are smooth only within what a step of these changes.

@@ -7,16 +7,18 @@ import torch
 
 import torchcloth as tc
 
-G = 9.81
+GRAVITY_M_PER_S2 = 9.81
 
 
-def sheet(boundaries, gravity=(0.0, 0.0, -G), size=0.1, n=4, effects=None, E=1e5, density=0.15, shape=None):
+def make_sheet(
+    boundaries, gravity=(0.0, 0.0, -GRAVITY_M_PER_S2), size=0.1, n=4, effects=None, E=1e5, density=0.15, shape=None
+):
     mesh = tc.meshes.rectangle(*(shape or (size, size)), resolution=n if isinstance(n, tuple) else (n, n))
     forces = {"gravity": tc.effects.Gravity(gravity)} if gravity is not None else {}
     return tc.Cloth(mesh, tc.materials.AEP(E, 0.05), density, forces | (effects or {}), boundaries, contact=None)
 
 
-def path(t, position, rotation=None):
+def make_trajectory(t, position, rotation=None):
     """A trajectory from positions [K, 3] and rotations [K, 3, 3]."""
     t = torch.as_tensor(t)
     pose = torch.eye(4).repeat(len(t), 1, 1)
@@ -26,12 +28,12 @@ def path(t, position, rotation=None):
     return tc.Trajectory(t, pose, torch.ones(len(t), dtype=bool))
 
 
-def about_z(angle):
+def rotate_about_z(angle):
     c, s, o = torch.cos(angle), torch.sin(angle), torch.zeros_like(angle)
     return torch.stack([c, -s, o, s, c, o, o, o, o + 1], -1).reshape(-1, 3, 3)
 
 
-def block(size, centre):
+def make_box_mesh(size, centre):
     """A box as a triangle mesh."""
     corners = np.array([[i, j, k] for i in (-0.5, 0.5) for j in (-0.5, 0.5) for k in (-0.5, 0.5)])
     faces = [[0, 1, 3], [0, 3, 2], [4, 6, 7], [4, 7, 5], [0, 4, 5], [0, 5, 1]]
@@ -39,16 +41,23 @@ def block(size, centre):
     return corners * np.array(size) + np.array(centre), np.array(faces)
 
 
-def lowered(z):
+def translate_along_z(z):
     pose = torch.eye(4)
     pose[2, 3] = z
     return pose
 
 
-def slide(body, angle, direction=(1.0, 0.0), start=0.0, time=0.3):
+def simulate_sliding(body, angle, direction=(1.0, 0.0), start=0.0, time=0.3):
     """(displacement [V, 3] m, final velocity [V, 3]) of a sheet on a body at z = 0 under tilted gravity."""
     a, b = direction
-    cloth = sheet({"body": body}, (G * math.sin(angle) * a, G * math.sin(angle) * b, -G * math.cos(angle)))
+    cloth = make_sheet(
+        {"body": body},
+        (
+            GRAVITY_M_PER_S2 * math.sin(angle) * a,
+            GRAVITY_M_PER_S2 * math.sin(angle) * b,
+            -GRAVITY_M_PER_S2 * math.cos(angle),
+        ),
+    )
     x = cloth.rest_state().x - torch.tensor([0.05, 0.05, 0.0])
     v = torch.zeros_like(x)
     v[:, 0], v[:, 1] = start * a, start * b

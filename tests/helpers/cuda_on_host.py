@@ -21,7 +21,7 @@ from torchcloth.engine import building, devices, execution
 from torchcloth.engine.cuda import launch as runs
 from torchcloth.engine.fused import FusedEngine
 
-HOST = """
+HOST_PREAMBLE = """
 #include <cmath>
 #include <condition_variable>
 #include <mutex>
@@ -68,7 +68,7 @@ static void next_one() {{
     end(), begin(round + 1);
 }}
 """
-LAUNCH = """
+LAUNCH_FUNCTIONS = """
 template <class F>
 static void each(int blocks, F work) {
     for (int block = 0; block < blocks; block++) {
@@ -89,29 +89,31 @@ extern "C" void launch_adjoint(int blocks, Port* p, R* d, int* t, R* w, unsigned
     each(blocks, [&] { adjoint(p, d, t, w, masks, grids, substeps, first, all); });
 }
 """
-SHARED: list[Path] = []  # the folder of what is compiled, for all processes that run tests
-FLAGS = ["-std=c++20", "-O1", "-ffp-contract=off", "-fPIC", "-shared", "-pthread", "-w"]
+BUILD_FOLDER: list[Path] = []  # the folder of what is compiled, for all processes that run tests
+COMPILER_FLAGS = ["-std=c++20", "-O1", "-ffp-contract=off", "-fPIC", "-shared", "-pthread", "-w"]
 
 
 @cache
-def compiled(text):
+def compile_program(text):
     """Each once in a run of the tests: compilers take a second."""
-    library = SHARED[0] / f"{hashlib.sha256(text.encode()).hexdigest()}.so"
+    library = BUILD_FOLDER[0] / f"{hashlib.sha256(text.encode()).hexdigest()}.so"
     if not library.exists():
-        with tempfile.TemporaryDirectory(dir=SHARED[0]) as folder:
+        with tempfile.TemporaryDirectory(dir=BUILD_FOLDER[0]) as folder:
             file = Path(folder) / "program.cpp"
             file.write_text(text)
-            subprocess.run([*building.compiler(), *FLAGS, "-o", f"{file}.so", str(file)], check=True)
+            subprocess.run([*building.compiler(), *COMPILER_FLAGS, "-o", f"{file}.so", str(file)], check=True)
             os.replace(f"{file}.so", library)
     return ctypes.CDLL(str(library))
 
 
-class Host:
+class HostProgram:
     """A text, compiled here."""
 
     def __init__(self, text, threads, reverse):
         self.threads = threads
-        self._library = compiled(HOST.format(threads=threads, reversed=str(reverse).lower()) + text + LAUNCH)
+        self._library = compile_program(
+            HOST_PREAMBLE.format(threads=threads, reversed=str(reverse).lower()) + text + LAUNCH_FUNCTIONS
+        )
 
     def launch(self, name, blocks, shared, arguments):
         assert shared <= 8 << 16
@@ -119,19 +121,19 @@ class Host:
 
 
 @contextmanager
-def stand_in(threads=1, reverse=False):
+def replace_device_by_host(threads=1, reverse=False):
     """Programs for the CPU are compiled for it."""
     with (
-        patch.object(runs, "kernels", lambda text, device: Host(text, threads, reverse)),
+        patch.object(runs, "kernels", lambda text, device: HostProgram(text, threads, reverse)),
         patch.object(runs, "_device_programs", WeakKeyDictionary()),
     ):
         yield
 
 
-CHECKED: set[str] = set()  # kernels, in this process
+CHECKED_KERNELS: set[str] = set()  # kernels, in this process
 
 
-def agrees(cloth, motion, state, substeps=60, dt=1e-4, stages=0, marks=(1e-11, 1e-9)):
+def check_device_agreement(cloth, motion, state, substeps=60, dt=1e-4, stages=0, marks=(1e-11, 1e-9)):
     """Values and adjoints of a program on a device, or here, and by the processor's own engine, in float64.
 
     Compilers take a while: only where there is a kernel that was not looked at yet.
@@ -143,9 +145,9 @@ def agrees(cloth, motion, state, substeps=60, dt=1e-4, stages=0, marks=(1e-11, 1
     with patch.object(devices, "is_on_device", lambda tensor: True):
         fused = FusedEngine(model, state, prescribed)
     used = {str(given[0]) if name == "kernel" else name for name, given in fused.builder.program.recorded_calls}
-    if used <= CHECKED:
+    if used <= CHECKED_KERNELS:
         return
-    CHECKED.update(used)
+    CHECKED_KERNELS.update(used)
     job = fused.job(state, torch.full((substeps,), dt, dtype=torch.float64), prescribed)
     job = job._replace(inputs={f: t.detach().contiguous() for f, t in job.inputs.items()})
     ends = (substeps // 3, substeps)
@@ -156,7 +158,7 @@ def agrees(cloth, motion, state, substeps=60, dt=1e-4, stages=0, marks=(1e-11, 1
     seeds = {f: torch.randn(job.scenes, f.rows, f.comps, generator=generator, dtype=job.like.dtype) for f in known}
     before = execution.reverse(job, execution.forward(job, 1)[1], 1, seeds, set(job.inputs))
     device = "cuda" if torch.cuda.is_available() else "cpu"
-    with stand_in() if device == "cpu" else nullcontext():
+    with replace_device_by_host() if device == "cpu" else nullcontext():
         there = job._replace(inputs={f: t.to(device) for f, t in job.inputs.items()})
         results, masks = runs.forward(there._replace(frame_ends=ends))
         after = runs.reverse(there, masks, {f: t.to(device) for f, t in seeds.items()}, set(job.inputs))

@@ -17,7 +17,7 @@ from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
 
 import torchcloth as tc
-from helpers.cuda_on_host import agrees
+from helpers.cuda_on_host import check_device_agreement
 from torchcloth.boundaries import PrescribedMotion
 from torchcloth.boundaries.motion import sample_trajectory
 from torchcloth.dynamics import substep
@@ -25,7 +25,7 @@ from torchcloth.engine import cuda_graphs, execution, fused
 from torchcloth.simulation.rollout import SUBSTEPS_PER_CHECKPOINT
 from torchcloth.types import ClothState, Trajectory
 
-VALUES, GRADIENTS = 1e-10, 1e-8  # relative, in float64
+VALUE_TOLERANCE, GRADIENT_TOLERANCE = 1e-10, 1e-8  # relative, in float64
 
 
 class Outcome(NamedTuple):
@@ -35,19 +35,19 @@ class Outcome(NamedTuple):
     gradients: dict[str, Tensor | None]
 
 
-def agree(
+def check_agreement(
     cloth: tc.Cloth,
     motion: Mapping[str, Trajectory],
     state: ClothState,
     substeps: int = 100,
     dt: float = 1e-4,
-    marks: tuple[float, float] = (VALUES, GRADIENTS),
+    marks: tuple[float, float] = (VALUE_TOLERANCE, GRADIENT_TOLERANCE),
     stages: int = 0,
 ) -> dict[str, float]:
     """Demand agreement; the largest differences by name are returned for reports."""
-    reference = outcome(in_chunks, cloth, motion, state, substeps, dt, stages)
-    engine = outcome(fused.rollout, cloth, motion, state, substeps, dt, stages)
-    results = {name: difference(engine.values[name], value) for name, value in reference.values.items()}
+    reference = compute_outcome(roll_out_in_segments, cloth, motion, state, substeps, dt, stages)
+    engine = compute_outcome(fused.rollout, cloth, motion, state, substeps, dt, stages)
+    results = {name: relative_difference(engine.values[name], value) for name, value in reference.values.items()}
     worse = {name: value for name, value in results.items() if not value <= marks[0]}
     assert set(engine.values) == set(reference.values)
     assert not worse, worse
@@ -55,20 +55,20 @@ def agree(
         other = engine.gradients[name]
         assert (value is None) == (other is None), f"only one engine has a gradient of {name}"
         if value is not None and other is not None:
-            results[f"d/d {name}"] = difference(other, value)
+            results[f"d/d {name}"] = relative_difference(other, value)
     worse = {name: value for name, value in results.items() if not value <= marks[1]}
     assert not worse, worse
-    runs_on_any_device(cloth, motion, state, dt, stages)
-    agrees(cloth, motion, state, dt=dt, stages=stages)
-    results["tangents"] = tangents_transpose(cloth, motion, state, substeps, dt, stages)
+    check_graph_capture(cloth, motion, state, dt, stages)
+    check_device_agreement(cloth, motion, state, dt=dt, stages=stages)
+    results["tangents"] = tangent_adjoint_error(cloth, motion, state, substeps, dt, stages)
     assert results["tangents"] <= marks[1], results["tangents"]
     if not stages:
-        results["layer"] = layer_transposes(cloth, motion, state, substeps, dt)
+        results["layer"] = sensitivity_adjoint_error(cloth, motion, state, substeps, dt)
         assert results["layer"] <= marks[1], results["layer"]
     return results
 
 
-def runs_on_any_device(
+def check_graph_capture(
     cloth: tc.Cloth, motion: Mapping[str, Trajectory], state: ClothState, dt: float, stages: int
 ) -> None:
     """A unit of the reference's substeps and its gradients on a device whose tensors have no numbers.
@@ -78,15 +78,15 @@ def runs_on_any_device(
     """
     prescribed = {
         name: PrescribedMotion(d.increment.to("meta"), d.pose.to("meta"), d.closed)
-        for name, d in prescribed_of(motion, 2, dt, {name: t.pose for name, t in motion.items()}).items()
+        for name, d in sample_motion(motion, 2, dt, {name: t.pose for name, t in motion.items()}).items()
     }
     closed = {name: d.closed[0] for name, d in prescribed.items()}
     model = deepcopy(cloth).to("meta").build_model()._replace(stages=stages)
     leaf = state.map(lambda t: t.to("meta").requires_grad_())
     compensation = torch.zeros_like(leaf.x, requires_grad=False) if state.x.dtype == torch.float32 else None
     moving = cuda_graphs.GraphInputs.of(leaf, compensation, dt, prescribed, 0, 2)
-    graphs = cuda_graphs.GraphedRollout(model, 2, watched)
-    unit = cuda_graphs.GraphedSegment(graphs.own_model, moving, closed, 2, watched)
+    graphs = cuda_graphs.GraphedRollout(model, 2, capture_on_one_device)
+    unit = cuda_graphs.GraphedSegment(graphs.own_model, moving, closed, 2, capture_on_one_device)
     unit.prepare(moving, graphs.parameters, graphs.leaves)
     end = unit(moving, graphs.parameters)
     (end.state.x.sum() + sum(value.sum() for value in end.impulses.values())).backward()
@@ -94,7 +94,7 @@ def runs_on_any_device(
     assert leaf.x.grad.is_meta
 
 
-def watched(work: cuda_graphs.Work, device: torch.device) -> tuple[list[Tensor], cuda_graphs.Replay]:
+def capture_on_one_device(work: cuda_graphs.Work, device: torch.device) -> tuple[list[Tensor], cuda_graphs.Replay]:
     """As a graph that is captured from tensors without numbers, which refuses what others it would have to wait for."""
     with OnOneDevice(device.type):
         return work(), lambda: None
@@ -116,7 +116,7 @@ class OnOneDevice(TorchDispatchMode):
         return out
 
 
-def layer_transposes(
+def sensitivity_adjoint_error(
     cloth: tc.Cloth, motion: Mapping[str, Trajectory], state: ClothState, substeps: int, dt: float
 ) -> float:
     """``Cloth.sensitivities`` along changes of all parameters against gradients: the largest relative difference."""
@@ -136,7 +136,7 @@ def layer_transposes(
     return float(((forward - reverse.sum(0)).abs() / (reverse.abs().sum(0) + 1e-12)).max())
 
 
-def in_chunks(model, state, dt, prescribed, substeps):
+def roll_out_in_segments(model, state, dt, prescribed, substeps):
     """``functional.rollout`` as ``Cloth`` calls it: near layers are searched again at the start of each call."""
     total = {}
     for first in range(0, substeps, SUBSTEPS_PER_CHECKPOINT):
@@ -147,13 +147,13 @@ def in_chunks(model, state, dt, prescribed, substeps):
     return state, total
 
 
-def outcome(rollout, cloth, motion, state: ClothState, substeps: int, dt: float, stages: int = 0) -> Outcome:
+def compute_outcome(rollout, cloth, motion, state: ClothState, substeps: int, dt: float, stages: int = 0) -> Outcome:
     """Of one of the engines."""
     cloth.zero_grad()
     leaf = state.map(lambda t: t.clone().requires_grad_())
     poses = {name: trajectory.pose.clone().requires_grad_() for name, trajectory in motion.items()}
     model = cloth.build_model()._replace(stages=stages)
-    end, impulses = rollout(model, leaf, dt, prescribed_of(motion, substeps, dt, poses), substeps)
+    end, impulses = rollout(model, leaf, dt, sample_motion(motion, substeps, dt, poses), substeps)
     values = {
         "displacement": end.x - state.x,
         "v": end.v,
@@ -161,7 +161,7 @@ def outcome(rollout, cloth, motion, state: ClothState, substeps: int, dt: float,
         **{f"memory {name}": value for name, value in end.memory.items()},
         **{f"impulse {name}": value for name, value in impulses.items()},
     }
-    some_function(values).backward()
+    random_scalar(values).backward()
     gradients = {"x": leaf.x.grad, "v": leaf.v.grad, **({"d3": leaf.d3.grad} if leaf.d3.numel() else {})}
     gradients |= {f"memory {name}": value.grad for name, value in leaf.memory.items()}
     gradients |= {f"pose {name}": pose.grad for name, pose in poses.items()}
@@ -170,7 +170,7 @@ def outcome(rollout, cloth, motion, state: ClothState, substeps: int, dt: float,
     return Outcome({name: value.detach() for name, value in values.items()}, grads)
 
 
-def prescribed_of(motion: Mapping[str, Trajectory], substeps: int, dt: float, poses: Mapping[str, Tensor]):
+def sample_motion(motion: Mapping[str, Trajectory], substeps: int, dt: float, poses: Mapping[str, Tensor]):
     """The trajectories on the substeps, with these poses."""
     times = torch.linspace(0, substeps * dt, substeps + 1, dtype=torch.float64)
     return {
@@ -178,16 +178,16 @@ def prescribed_of(motion: Mapping[str, Trajectory], substeps: int, dt: float, po
     }
 
 
-def some_function(values: Mapping[str, Tensor]) -> Tensor:
+def random_scalar(values: Mapping[str, Tensor]) -> Tensor:
     """A number in which all count, whatever their units: every component over its size, times random weights."""
     total = torch.zeros(())
     for seed, value in enumerate(values.values()):
         size = _columns(value.detach()).norm(dim=0).clamp(min=1e-12)
-        total = total + (value / size * noise(value.shape, seed, value.dtype)).sum()
+        total = total + (value / size * draw_noise(value.shape, seed, value.dtype)).sum()
     return total
 
 
-def difference(value: Tensor, reference: Tensor) -> float:
+def relative_difference(value: Tensor, reference: Tensor) -> float:
     """The largest of the components' relative errors; a component that is 0 in the reference must be 0."""
     if value.shape != reference.shape or not bool(torch.isfinite(value).all()):
         return float("inf")
@@ -200,32 +200,34 @@ def _columns(value: Tensor) -> Tensor:
     return value.reshape(-1, value.shape[-1] if value.ndim > 1 else 1)
 
 
-def tangents_transpose(cloth, motion, state: ClothState, substeps: int, dt: float, stages: int, directions=9) -> float:
+def tangent_adjoint_error(
+    cloth, motion, state: ClothState, substeps: int, dt: float, stages: int, directions=9
+) -> float:
     """Relative error of <seed, J dot> = <J^T seed, dot> of the engine, for random dots of all inputs."""
     with torch.no_grad():
-        prescribed = prescribed_of(motion, substeps, dt, {name: t.pose for name, t in motion.items()})
+        prescribed = sample_motion(motion, substeps, dt, {name: t.pose for name, t in motion.items()})
         engine = fused.FusedEngine(cloth.build_model()._replace(stages=stages), state, prescribed)
         assert engine.torch_parts is None, f"not on the engine: {engine.torch_parts.parts}"
         job = engine.job(state, torch.full((substeps,), dt), prescribed)
         varied = {field for field in job.inputs if field != engine.builder.dt}  # the step itself is not differentiated
         results, records = execution.forward(job, 1)
-        seeds = {f: scaled(noise(t.shape, k, t.dtype), t) for k, (f, t) in enumerate(results.items())}
+        seeds = {f: scale_seeds(draw_noise(t.shape, k, t.dtype), t) for k, (f, t) in enumerate(results.items())}
         gradients = execution.reverse(job, records, 1, seeds, varied)
-        dots = {f: scaled_dots(f, job, gradients[f], directions) for f in varied}
+        dots = {f: draw_scaled_tangents(f, job, gradients[f], directions) for f in varied}
         _, moved = execution.tangent(job, dots, directions)
         forward = sum((seeds[f].unsqueeze(1) * t).flatten(2).sum(-1) for f, t in moved.items())
         parts = [(gradients[f].unsqueeze(1) * dots[f]).flatten(2).sum(-1) for f in varied]
         return float(((forward - sum(parts)).abs() / sum(part.abs() for part in parts)).max())
 
 
-def scaled(seed: Tensor, value: Tensor) -> Tensor:
+def scale_seeds(seed: Tensor, value: Tensor) -> Tensor:
     """Seeds per size of what they multiply."""
     return seed / value.abs().mean(1, keepdim=True).clamp(min=1e-12)
 
 
-def scaled_dots(field, job, gradient: Tensor, directions: int) -> Tensor:
+def draw_scaled_tangents(field, job, gradient: Tensor, directions: int) -> Tensor:
     """Random directions that all matter equally: [scenes, directions, rows, comps] over the gradient's size."""
-    dots = noise((len(gradient), directions, *gradient.shape[1:]), field.id, gradient.dtype)
+    dots = draw_noise((len(gradient), directions, *gradient.shape[1:]), field.id, gradient.dtype)
     if len(job.inputs[field]) == 1:
         dots = dots[:1].expand_as(dots)
     size = gradient.norm()
@@ -235,31 +237,31 @@ def scaled_dots(field, job, gradient: Tensor, directions: int) -> Tensor:
 # -- states in which something happens ----------------------------------------------------------------------------
 
 
-def moving(cloth: tc.Cloth, scenes: tuple[int, ...] = (), strain: float = 0.03, seed: int = 0) -> ClothState:
+def make_moving_state(cloth: tc.Cloth, scenes: tuple[int, ...] = (), strain: float = 0.03, seed: int = 0) -> ClothState:
     """Bent to curves of both signs, turned, strained and sheared, creased and moving; memory as yet virgin."""
     rest = cloth.rest_state().x
     size = (rest.amax(0) - rest.amin(0)).max()
     u, w = (2 * torch.pi * (rest[:, :2] - rest.amin(0)[:2]) / size).unbind(-1)
     bend = torch.stack([0.1 * torch.sin(w), 0.1 * torch.cos(2 * u), torch.sin(u) + torch.cos(w + u)], dim=-1)
-    x = rest + 0.04 * size * bend + 0.5 * strain * rest @ noise((3, 3), seed)
+    x = rest + 0.04 * size * bend + 0.5 * strain * rest @ draw_noise((3, 3), seed)
     edge = size / len(rest) ** 0.5
-    x = x + strain * edge * noise((*scenes, *x.shape), seed + 1)
-    turn = torch.linalg.qr(noise((3, 3), seed + 2))[0]
+    x = x + strain * edge * draw_noise((*scenes, *x.shape), seed + 1)
+    turn = torch.linalg.qr(draw_noise((3, 3), seed + 2))[0]
     turn = turn * torch.linalg.det(turn)
-    return cloth.state((x @ turn.mT).to(rest), 0.5 * noise(x.shape, seed + 3).to(rest))
+    return cloth.state((x @ turn.mT).to(rest), 0.5 * draw_noise(x.shape, seed + 3).to(rest))
 
 
-def moving_hand(cloth_time: float, knots: int = 3, scenes: tuple[int, ...] = ()) -> Trajectory:
+def make_moving_hand(cloth_time: float, knots: int = 3, scenes: tuple[int, ...] = ()) -> Trajectory:
     """A hand that moves and turns."""
     pose = torch.eye(4).repeat(*scenes, knots, 1, 1)
     angle = torch.linspace(0, 0.1, knots)
     pose[..., 0, 0], pose[..., 0, 1] = angle.cos(), -angle.sin()
     pose[..., 1, 0], pose[..., 1, 1] = angle.sin(), angle.cos()
-    pose[..., :3, 3] = 1e-3 * noise((*scenes, knots, 3), 11).to(pose)
+    pose[..., :3, 3] = 1e-3 * draw_noise((*scenes, knots, 3), 11).to(pose)
     times = torch.linspace(0, cloth_time, knots, dtype=torch.float64)
     return Trajectory(times, pose, torch.ones(knots, dtype=torch.bool))
 
 
-def noise(shape, seed: int, dtype: torch.dtype = torch.float64) -> Tensor:
+def draw_noise(shape, seed: int, dtype: torch.dtype = torch.float64) -> Tensor:
     """Standard normal numbers that do not depend on the global generator."""
     return torch.randn(tuple(shape), generator=torch.Generator().manual_seed(seed), dtype=torch.float64).to(dtype)

@@ -5,7 +5,7 @@ import torch
 import torchcloth as tc
 
 
-def sheet(engine="auto", *, effects=None, boundaries=None, material=None, n=5, **options):
+def make_sheet(engine="auto", *, effects=None, boundaries=None, material=None, n=5, **options):
     """A small sheet with weight, drag, bending and two hands."""
     mesh = tc.meshes.rectangle(0.2, 0.2, resolution=(n, n))
     if effects is None:
@@ -21,7 +21,7 @@ def sheet(engine="auto", *, effects=None, boundaries=None, material=None, n=5, *
     return tc.Cloth(mesh, material or tc.materials.AEP(1e5, 0.3), 0.2, effects, boundaries, engine=engine, **options)
 
 
-def opening(end, name_of_flags="left"):
+def make_opening_motion(end, name_of_flags="left"):
     """Two hands that travel; one lets go and takes hold again between the frames."""
     t = torch.linspace(0.0, end, 7)
     motion = {}
@@ -36,7 +36,7 @@ def opening(end, name_of_flags="left"):
     return motion
 
 
-def start(cloth, batch=()):
+def make_perturbed_state(cloth, batch=()):
     """Not at rest, not flat."""
     generator = torch.Generator().manual_seed(0)
     x = cloth.rest_state().x.expand(*batch, -1, -1)
@@ -45,7 +45,7 @@ def start(cloth, batch=()):
     return cloth.state(x, v)
 
 
-def close(a, b, mark, what):
+def check_close(a, b, mark, what):
     """Relative in the norm."""
     error = float((a - b).detach().norm() / b.detach().norm().clamp(min=1e-300))
     assert error < mark, f"{what}: {error:.2e}"

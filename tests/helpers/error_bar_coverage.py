@@ -20,10 +20,10 @@ import torch
 from helpers import stretched_sheets
 from torchcloth.identification import identify
 
-FITTED = ("youngs_modulus", "poisson_ratio", "air.normal")
+FITTED_PARAMETERS = ("youngs_modulus", "poisson_ratio", "air.normal")
 
 
-def fabric(seed: int) -> stretched_sheets.Fabric:
+def draw_fabric(seed: int) -> stretched_sheets.Fabric:
     """Drawn around the default; the study's own random numbers."""
     rng = np.random.default_rng(10_000 + seed)
     return stretched_sheets.Fabric(
@@ -31,33 +31,33 @@ def fabric(seed: int) -> stretched_sheets.Fabric:
     )
 
 
-def truth_of(given: stretched_sheets.Fabric) -> dict[str, float]:
+def true_values(given: stretched_sheets.Fabric) -> dict[str, float]:
     """By the names of the fit."""
-    values = (given.membrane / stretched_sheets.THICKNESS, given.poisson, given.drag)
-    return dict(zip(FITTED, values, strict=True))
+    values = (given.membrane / stretched_sheets.THICKNESS_M, given.poisson, given.drag)
+    return dict(zip(FITTED_PARAMETERS, values, strict=True))
 
 
-def twin(seed: int, refine: bool = False) -> dict:
+def run_twin(seed: int, refine: bool = False) -> dict:
     """One line of the study; ``refine``: corrected for the mesh."""
-    given = fabric(seed)
-    recording = stretched_sheets.record(given, seed)
+    given = draw_fabric(seed)
+    recording = stretched_sheets.record_episode(given, seed)
     began = time.process_time()
-    model = stretched_sheets.model(recording, youngs_modulus=8e4, poisson_ratio=0.25)
-    fit = identify(model, recording, FITTED, nuisances={"grasp": 1e-3}, refine=refine)
+    model = stretched_sheets.build_start_cloth(recording, youngs_modulus=8e4, poisson_ratio=0.25)
+    fit = identify(model, recording, FITTED_PARAMETERS, nuisances={"grasp": 1e-3}, refine=refine)
     line = {"seed": seed, "seconds": time.process_time() - began, "iterations": fit.fit["iterations"]}
-    for name, truth in truth_of(given).items():
+    for name, truth in true_values(given).items():
         e = fit.parameters[name]
         line[name] = {"truth": truth, "value": e.value, "std": e.std, "ci95": e.ci95, "identifiable": e.identifiable}
     return line | {"nuisances": {k: [e.value, e.std] for own in fit.nuisances.values() for k, e in own.items()}}
 
 
-def table(lines: list[dict]) -> dict[str, dict[str, float]]:
+def summarise_twins(lines: list[dict]) -> dict[str, dict[str, float]]:
     """By parameter: twins, share that is called identifiable, of those the share covered, bias and spread."""
     out = {}
-    for name in FITTED:
+    for name in FITTED_PARAMETERS:
         own = [line[name] for line in lines]
         known = [e for e in own if e["identifiable"]]
-        z = np.array([_normalised(e) for e in known])
+        z = np.array([_normalised_error(e) for e in known])
         inside = [e["ci95"][0] <= e["truth"] <= e["ci95"][1] for e in known]
         out[name] = {
             "identifiable": len(known) / len(own),
@@ -70,20 +70,20 @@ def table(lines: list[dict]) -> dict[str, dict[str, float]]:
     return out
 
 
-def _normalised(e: dict) -> float:
+def _normalised_error(e: dict) -> float:
     """Error over its standard deviation; the latter from the interval, in the value's coordinate."""
     low, high = e["ci95"]
     half = (high - e["value"] if e["truth"] > e["value"] else e["value"] - low) / 1.96
     return (e["value"] - e["truth"]) / max(half, 1e-300)
 
 
-def run(path: Path, twins: int, first: int = 0, refine: bool = False) -> list[dict]:
+def run_twins(path: Path, twins: int, first: int = 0, refine: bool = False) -> list[dict]:
     """All twins that ``path`` does not hold yet."""
     lines = [json.loads(text) for text in path.read_text().splitlines()] if path.exists() else []
     done = {line["seed"] for line in lines}
     for seed in range(first, first + twins):
         if seed not in done:
-            lines.append(twin(seed, refine))
+            lines.append(run_twin(seed, refine))
             with path.open("a") as file:
                 file.write(json.dumps(lines[-1]) + "\n")
             print(f"twin {seed}: {lines[-1]['seconds']:.1f} s", file=sys.stderr, flush=True)
@@ -100,7 +100,7 @@ def main() -> None:
     options = parser.parse_args()
     torch.set_default_dtype(torch.float64)
     torch.set_num_threads(1)
-    found = table(run(options.out, options.twins, options.first, options.refine))
+    found = summarise_twins(run_twins(options.out, options.twins, options.first, options.refine))
     for name, row in found.items():
         print(f"{name:16s} " + "  ".join(f"{k} {v:.3f}" for k, v in row.items() if not math.isnan(v)))
 

@@ -14,15 +14,15 @@ from PIL import Image
 
 from helpers import lerobot_dataset as lerobot_truth
 
-POSE = [[0.0, 1.0, 0.0, 0.5], [1.0, 0.0, 0.0, 0.1], [0.0, 0.0, -1.0, 1.5], [0.0, 0.0, 0.0, 1.0]]
-CLOTH = {"sheet": {"width": 0.3, "height": 0.2}, "areal_density": 0.15, "thickness": 5e-4}
-KNOWN = {"cloth": CLOTH, "provenance": "measured"}
-WIDTH, HEIGHT, FRAMES = 16, 12, 3
-EPOCH = 1_700_000_000_123_456_789  # ns; not a multiple of what float64 seconds can tell apart
+CAMERA_POSE = [[0.0, 1.0, 0.0, 0.5], [1.0, 0.0, 0.0, 0.1], [0.0, 0.0, -1.0, 1.5], [0.0, 0.0, 0.0, 1.0]]
+CLOTH_DESCRIPTION = {"sheet": {"width": 0.3, "height": 0.2}, "areal_density": 0.15, "thickness": 5e-4}
+SCENE_DESCRIPTION = {"cloth": CLOTH_DESCRIPTION, "provenance": "measured"}
+IMAGE_WIDTH_PX, IMAGE_HEIGHT_PX, FRAME_COUNT = 16, 12, 3
+FIRST_STAMP_NS = 1_700_000_000_123_456_789  # ns; not a multiple of what float64 seconds can tell apart
 
 
 @dataclass
-class Foreign:
+class ForeignRecording:
     """A recording on disk, the scene that completes it, and what must be read."""
 
     path: Path
@@ -38,35 +38,37 @@ class Foreign:
         return path
 
 
-def pictures(seed: int = 0) -> tuple[list[np.ndarray], list[np.ndarray]]:
+def draw_images(seed: int = 0) -> tuple[list[np.ndarray], list[np.ndarray]]:
     """Depth [mm, 1 to 2 m, some invalid] and colour images."""
     rng = np.random.default_rng(seed)
-    depth = [rng.integers(1000, 2000, (HEIGHT, WIDTH)).astype(np.uint16) for _ in range(FRAMES)]
+    depth = [rng.integers(1000, 2000, (IMAGE_HEIGHT_PX, IMAGE_WIDTH_PX)).astype(np.uint16) for _ in range(FRAME_COUNT)]
     depth[0][0, :3] = 0
-    return depth, [rng.integers(0, 255, (HEIGHT, WIDTH, 3), dtype=np.uint8) for _ in range(FRAMES)]
+    return depth, [
+        rng.integers(0, 255, (IMAGE_HEIGHT_PX, IMAGE_WIDTH_PX, 3), dtype=np.uint8) for _ in range(FRAME_COUNT)
+    ]
 
 
-def jpeg(pixels: np.ndarray) -> bytes:
+def encode_jpeg(pixels: np.ndarray) -> bytes:
     file = io.BytesIO()
     Image.fromarray(pixels).save(file, "JPEG", quality=95)
     return file.getvalue()
 
 
-def png(pixels: np.ndarray) -> bytes:
+def encode_png(pixels: np.ndarray) -> bytes:
     file = io.BytesIO()
     Image.fromarray(pixels).save(file, "PNG")
     return file.getvalue()
 
 
-def decoded(data: bytes) -> np.ndarray:
+def decode_image(data: bytes) -> np.ndarray:
     return np.asarray(Image.open(io.BytesIO(data)).convert("RGB"))
 
 
-def redwood(folder: Path) -> Foreign:
+def write_redwood(folder: Path) -> ForeignRecording:
     """By open3d.io."""
     import open3d as o3d
 
-    root, (depth, color) = folder / "redwood", pictures()
+    root, (depth, color) = folder / "redwood", draw_images()
     for kind in ("depth", "color"):
         (root / kind).mkdir(parents=True)
     stamps = [33_369, 66_736, 100_103]
@@ -74,24 +76,24 @@ def redwood(folder: Path) -> Foreign:
         name = f"{i + 1:07d}-{us:012d}.png"
         o3d.io.write_image(str(root / "depth" / name), o3d.geometry.Image(depth[i]))
         o3d.io.write_image(str(root / "color" / name), o3d.geometry.Image(color[i]))
-    intrinsic = o3d.camera.PinholeCameraIntrinsic(WIDTH, HEIGHT, 14.0, 15.0, 7.5, 5.25)
+    intrinsic = o3d.camera.PinholeCameraIntrinsic(IMAGE_WIDTH_PX, IMAGE_HEIGHT_PX, 14.0, 15.0, 7.5, 5.25)
     o3d.io.write_pinhole_camera_intrinsic(str(root / "camera_intrinsic.json"), intrinsic)
     one = o3d.camera.PinholeCameraParameters()
-    one.intrinsic, one.extrinsic = intrinsic, np.linalg.inv(POSE)  # Open3D's extrinsic is world to camera
+    one.intrinsic, one.extrinsic = intrinsic, np.linalg.inv(CAMERA_POSE)  # Open3D's extrinsic is world to camera
     trajectory = o3d.camera.PinholeCameraTrajectory()
-    trajectory.parameters = [one] * FRAMES
+    trajectory.parameters = [one] * FRAME_COUNT
     o3d.io.write_pinhole_camera_trajectory(str(root / "trajectory.log"), trajectory)
     times = [(us - stamps[0]) / 1e6 for us in stamps]
     both = {"cam0/depth": depth, "cam0/color": color}
-    return Foreign(root, dict(KNOWN), both, dict.fromkeys(both, times))
+    return ForeignRecording(root, dict(SCENE_DESCRIPTION), both, dict.fromkeys(both, times))
 
 
-TUM_K = [[14.0, 0.0, 7.5], [0.0, 15.0, 5.25], [0.0, 0.0, 1.0]]
+INTRINSICS_PX = [[14.0, 0.0, 7.5], [0.0, 15.0, 5.25], [0.0, 0.0, 1.0]]
 
 
-def tum(folder: Path) -> Foreign:
+def write_tum(folder: Path) -> ForeignRecording:
     """In the published layout; colour comes 12 ms after depth, and once more at the end."""
-    root, (depth, color) = folder / "tum", pictures(1)
+    root, (depth, color) = folder / "tum", draw_images(1)
     color.append(color[0][::-1].copy())
     names = {"depth": ("depth", depth, 0), "rgb": ("color", color, 12_000)}
     times = {}
@@ -100,7 +102,7 @@ def tum(folder: Path) -> Foreign:
         lines = [f"# {name} images", "# file: 'x.bag'", "# timestamp filename"]
         for i, pixels in enumerate(images):
             stamp = f"1305031102.{175_304 + i * 33_333 + late}"
-            (root / name / f"{stamp}.png").write_bytes(png(pixels))
+            (root / name / f"{stamp}.png").write_bytes(encode_png(pixels))
             lines.append(f"{stamp} {name}/{stamp}.png")
         (root / f"{name}.txt").write_text("\n".join(lines) + "\n")
         times[f"cam0/{kind}"] = [(i * 33_333 + late) / 1e6 for i in range(len(images))]
@@ -109,11 +111,14 @@ def tum(folder: Path) -> Foreign:
     lines = ["# ground truth trajectory", "# timestamp tx ty tz qx qy qz qw"]
     lines += [f"{1305031102.1758 + i / 100:.4f} {pose}" for i in range(10)]
     (root / "groundtruth.txt").write_text("\n".join(lines) + "\n")
-    scene = {**KNOWN, "cameras": {"cam0": {"K": TUM_K, "distortion": [0.26, -0.95, -0.005, 0.0026, 1.16]}}}
-    return Foreign(root, scene, {"cam0/depth": depth, "cam0/color": color}, times)
+    scene = {
+        **SCENE_DESCRIPTION,
+        "cameras": {"cam0": {"K": INTRINSICS_PX, "distortion": [0.26, -0.95, -0.005, 0.0026, 1.16]}},
+    }
+    return ForeignRecording(root, scene, {"cam0/depth": depth, "cam0/color": color}, times)
 
 
-def ros2(folder: Path, storage: str = "mcap", *, seal: bool = False) -> Foreign:
+def write_ros2(folder: Path, storage: str = "mcap", *, seal: bool = False) -> ForeignRecording:
     """By rosbags' writer, in the standard messages of ROS 2."""
     from rosbags.rosbag2 import StoragePlugin, Writer
     from rosbags.typesys import Stores, get_typestore
@@ -122,9 +127,9 @@ def ros2(folder: Path, storage: str = "mcap", *, seal: bool = False) -> Foreign:
 
     store = get_typestore(Stores.ROS2_HUMBLE)
     plugin = StoragePlugin.MCAP if storage == "mcap" else StoragePlugin.SQLITE3
-    root, (depth, color) = folder / f"bag_{storage}", pictures(2)
+    root, (depth, color) = folder / f"bag_{storage}", draw_images(2)
     rng, n = np.random.default_rng(3), 5
-    stamps = [EPOCH + i * 10_000_000 for i in range(n)]
+    stamps = [FIRST_STAMP_NS + i * 10_000_000 for i in range(n)]
     position, quat = rng.normal(0, 0.2, (n, 3)), rng.normal(size=(n, 4))
     quat /= np.linalg.norm(quat, axis=1, keepdims=True)
     q, width, force = rng.normal(size=(n, 7)), np.linspace(0.04, 0.0, n), rng.normal(size=(n, 6))
@@ -138,15 +143,26 @@ def ros2(folder: Path, storage: str = "mcap", *, seal: bool = False) -> Foreign:
     def image(ns: int, encoding: str, pixels: np.ndarray):
         step = pixels.strides[0]
         raw = np.ascontiguousarray(pixels).reshape(-1).view(np.uint8)
-        return make(sensor + "Image", header(ns, "lens"), HEIGHT, WIDTH, encoding, 0, step, raw)
+        return make(sensor + "Image", header(ns, "lens"), IMAGE_HEIGHT_PX, IMAGE_WIDTH_PX, encoding, 0, step, raw)
 
     def info(ns: int):
-        K, D = np.array(TUM_K).reshape(-1), np.array([0.26, -0.95, -0.005, 0.0026, 1.16])
-        P = np.column_stack([TUM_K, np.zeros(3)]).reshape(-1)
+        K, D = np.array(INTRINSICS_PX).reshape(-1), np.array([0.26, -0.95, -0.005, 0.0026, 1.16])
+        P = np.column_stack([INTRINSICS_PX, np.zeros(3)]).reshape(-1)
         region = make(sensor + "RegionOfInterest", 0, 0, 0, 0, False)
         head = header(ns, "lens")
         return make(
-            sensor + "CameraInfo", head, HEIGHT, WIDTH, "plumb_bob", D, K, np.eye(3).reshape(-1), P, 0, 0, region
+            sensor + "CameraInfo",
+            head,
+            IMAGE_HEIGHT_PX,
+            IMAGE_WIDTH_PX,
+            "plumb_bob",
+            D,
+            K,
+            np.eye(3).reshape(-1),
+            P,
+            0,
+            0,
+            region,
         )
 
     def cloud(ns: int, xyz: np.ndarray):
@@ -201,7 +217,7 @@ def ros2(folder: Path, storage: str = "mcap", *, seal: bool = False) -> Foreign:
             sensor + "Image",
             [(ns, image(ns, "bgr8", c)) for ns, c in zip(stamps, swapped, strict=False)],
         )
-        compressed = [jpeg(c) for c in color]
+        compressed = [encode_jpeg(c) for c in color]
         kind, files = sensor + "CompressedImage", [np.frombuffer(c, dtype=np.uint8) for c in compressed]
         put(
             "/lens/jpeg",
@@ -213,9 +229,12 @@ def ros2(folder: Path, storage: str = "mcap", *, seal: bool = False) -> Foreign:
     joint_map = {"topic": "/joint_states", "names": [f"j{k}" for k in range(7)], "width": "finger"}
     left = {"pose": "/left/pose", "closed": "/closed", "wrench": "/left/ft", "wrench_frame": "world"}
     scene = {
-        **KNOWN,
+        **SCENE_DESCRIPTION,
         "robots": {"arm": {"model": "rizon4", "T_world_base": np.eye(4).tolist()}},
-        "cameras": {"cam0": {"T_world_camera": POSE}, "cam1": {"T_world_camera": POSE, "K": TUM_K}},
+        "cameras": {
+            "cam0": {"T_world_camera": CAMERA_POSE},
+            "cam1": {"T_world_camera": CAMERA_POSE, "K": INTRINSICS_PX},
+        },
         "source": {
             "motion": {"left": left, "arm": {"joints": joint_map, "closed": True}},
             "points": {"topic": "/cloth"},
@@ -231,7 +250,7 @@ def ros2(folder: Path, storage: str = "mcap", *, seal: bool = False) -> Foreign:
         "cam0/depth": depth,
         "cam0/color": color,
         "cam1/depth": fine,
-        "cam1/color": [decoded(c) for c in compressed],
+        "cam1/color": [decode_image(c) for c in compressed],
     }
     arrays = {
         "left/position": position,
@@ -242,39 +261,60 @@ def ros2(folder: Path, storage: str = "mcap", *, seal: bool = False) -> Foreign:
     arrays |= {"left/closed": np.arange(n) < 3, "arm/q": q, "arm/width": width, "arm/closed": np.ones(n, bool)}
     arrays |= {"left/t": np.arange(n) / 100, "arm/t": np.arange(n) / 100, "points/t": np.arange(2) / 100}
     arrays |= {"points/xyz": np.concatenate(clouds).astype(float)}
-    times = {key: [i / 100 for i in range(FRAMES)] for key in images}
-    return Foreign(root, scene, images, times, arrays)
+    times = {key: [i / 100 for i in range(FRAME_COUNT)] for key in images}
+    return ForeignRecording(root, scene, images, times, arrays)
 
 
-def lerobot(folder: Path) -> Foreign:
+def copy_lerobot(folder: Path) -> ForeignRecording:
     """A copy of the data set that lerobot itself wrote, second episode."""
     import shutil
 
-    root = Path(shutil.copytree(lerobot_truth.FOLDER / "dataset", folder / "lerobot"))
-    names = lerobot_truth.NAMES
+    root = Path(shutil.copytree(lerobot_truth.LEROBOT_FOLDER / "dataset", folder / "lerobot"))
+    names = lerobot_truth.STATE_NAMES
     source = {
         "motion": {"left": {"column": "observation.state", "joints": names[:7], "unit": "rad", "width": names[7]}},
-        "cameras": {"cam0": {"color": lerobot_truth.CAMERA}},
+        "cameras": {"cam0": {"color": lerobot_truth.CAMERA_KEY}},
     }
-    scene = {**KNOWN, "source": source, "cameras": {"cam0": {"T_world_camera": POSE, "K": TUM_K}}}
-    length = lerobot_truth.LENGTHS[1]
-    states = np.array([lerobot_truth.state(1, i) for i in range(length)], dtype=np.float64)
-    t = np.arange(length) / lerobot_truth.FPS
+    scene = {
+        **SCENE_DESCRIPTION,
+        "source": source,
+        "cameras": {"cam0": {"T_world_camera": CAMERA_POSE, "K": INTRINSICS_PX}},
+    }
+    length = lerobot_truth.EPISODE_LENGTHS[1]
+    states = np.array([lerobot_truth.make_state(1, i) for i in range(length)], dtype=np.float64)
+    t = np.arange(length) / lerobot_truth.DATASET_RATE_HZ
     grey = [
-        np.full((lerobot_truth.HEIGHT, lerobot_truth.WIDTH, 3), lerobot_truth.grey(1, i), np.uint8)
+        np.full(
+            (lerobot_truth.VIDEO_HEIGHT_PX, lerobot_truth.VIDEO_WIDTH_PX, 3), lerobot_truth.grey_level(1, i), np.uint8
+        )
         for i in range(length)
     ]
     arrays = {"left/q": states[:, :7], "left/width": states[:, 7], "left/t": t}
-    return Foreign(root, scene, {"cam0/color": grey}, {"cam0/color": t.tolist()}, arrays, {"episode": 1})
+    return ForeignRecording(root, scene, {"cam0/color": grey}, {"cam0/color": t.tolist()}, arrays, {"episode": 1})
 
 
-FACTORY = [0.50148, 0.49705, 0.49204, 0.49193, 4.7247, 3.2092, 0.1706, 5.0559, 4.7758, 0.88649, 0, 0, 1.24e-4, 5.9e-6]
-TILT = 0.1  # rad, of depth from colour; close to the real 6 degrees
+FACTORY_LENS_PARAMETERS = [
+    0.50148,
+    0.49705,
+    0.49204,
+    0.49193,
+    4.7247,
+    3.2092,
+    0.1706,
+    5.0559,
+    4.7758,
+    0.88649,
+    0,
+    0,
+    1.24e-4,
+    5.9e-6,
+]
+DEPTH_CAMERA_TILT_RAD = 0.1  # rad, of depth from colour; close to the real 6 degrees
 
 
-def calibration() -> dict:
+def make_calibration() -> dict:
     """Attached by k4arecorder; the numbers of a real device (k4a issue 1617) for the depth lens."""
-    c, s = np.cos(TILT), np.sin(TILT)
+    c, s = np.cos(DEPTH_CAMERA_TILT_RAD), np.sin(DEPTH_CAMERA_TILT_RAD)
     turn = [1.0, 0.0, 0.0, 0.0, c, -s, 0.0, s, c]
 
     def lens(place: str, values: list, size: tuple[int, int], turn: list, shift: list) -> dict:
@@ -284,15 +324,15 @@ def calibration() -> dict:
         return {"Intrinsics": model, "Location": place, "Rt": rt, "SensorWidth": size[0], "SensorHeight": size[1]}
 
     unmoved = np.eye(3).reshape(-1).tolist()
-    color = [0.5, 0.5, 0.48, 0.64, *FACTORY[4:]]
+    color = [0.5, 0.5, 0.48, 0.64, *FACTORY_LENS_PARAMETERS[4:]]
     lenses = [
-        lens("CALIBRATION_CameraLocationD0", FACTORY, (1024, 1024), unmoved, [0.0, 0.0, 0.0]),
+        lens("CALIBRATION_CameraLocationD0", FACTORY_LENS_PARAMETERS, (1024, 1024), unmoved, [0.0, 0.0, 0.0]),
         lens("CALIBRATION_CameraLocationPV0", color, (4096, 3072), turn, [-0.032, -0.002, 0.004]),
     ]
     return {"CalibrationInformation": {"Cameras": lenses}}
 
 
-def kinect(folder: Path, *, size: tuple[int, int] = (320, 288), frames: int = FRAMES) -> Foreign:
+def write_kinect(folder: Path, *, size: tuple[int, int] = (320, 288), frames: int = FRAME_COUNT) -> ForeignRecording:
     """By FFmpeg's Matroska writer, with tracks, tags and attachment as k4arecorder leaves them.
 
     FFmpeg stores raw video without its fourcc; it is put there afterwards, as k4arecorder has it.
@@ -304,7 +344,7 @@ def kinect(folder: Path, *, size: tuple[int, int] = (320, 288), frames: int = FR
     blocks = [rng.integers(500, 3000, (size[1] // 32, size[0] // 32)) for _ in range(frames)]
     depth = [np.kron(b, np.ones((32, 32))).astype(np.uint16) for b in blocks]
     colors = [np.full((720, 1280, 3), 40 + 30 * i, dtype=np.uint8) for i in range(frames)]
-    files = [jpeg(c) for c in colors]
+    files = [encode_jpeg(c) for c in colors]
     with av.open(str(path), "w", format="matroska", container_options={"allow_raw_vfw": "1"}) as container:
         container.metadata["K4A_DEVICE_SERIAL_NUMBER"] = "000123"
         color = container.add_mux_stream("mjpeg", rate=30, width=1280, height=720, pix_fmt="yuvj420p")
@@ -314,7 +354,9 @@ def kinect(folder: Path, *, size: tuple[int, int] = (320, 288), frames: int = FR
         raw.metadata["title"] = "DEPTH"
         imu = container.add_mux_stream("subrip", rate=1000)
         imu.metadata["title"] = "IMU"
-        container.add_attachment("calibration.json", "application/octet-stream", json.dumps(calibration()).encode())
+        container.add_attachment(
+            "calibration.json", "application/octet-stream", json.dumps(make_calibration()).encode()
+        )
         for i in range(frames):
             for stream, data in ((color, files[i]), (imu, bytes(24))):
                 packet = av.Packet(data)
@@ -331,9 +373,15 @@ def kinect(folder: Path, *, size: tuple[int, int] = (320, 288), frames: int = FR
     data[at : at + 20] = struct.pack("<IiiHH4s", 40, *size, 1, 16, b"b16g")
     path.write_bytes(data.replace(b"S_TEXT/UTF8", b"S_K4A/IMU\0\0"))
     times = [round(i / 30, 3) for i in range(frames)]
-    images = {"depth/depth": depth, "color/color": [decoded(f) for f in files]}
-    scene = {**KNOWN, "cameras": {"depth": {"T_world_camera": POSE}}}
-    return Foreign(path, scene, images, dict.fromkeys(images, times))
+    images = {"depth/depth": depth, "color/color": [decode_image(f) for f in files]}
+    scene = {**SCENE_DESCRIPTION, "cameras": {"depth": {"T_world_camera": CAMERA_POSE}}}
+    return ForeignRecording(path, scene, images, dict.fromkeys(images, times))
 
 
-WRITERS = {"redwood": redwood, "tum": tum, "ros2": ros2, "lerobot": lerobot, "kinect": kinect}
+WRITERS = {
+    "redwood": write_redwood,
+    "tum": write_tum,
+    "ros2": write_ros2,
+    "lerobot": copy_lerobot,
+    "kinect": write_kinect,
+}

@@ -2,17 +2,17 @@
 
 from torch.func import functional_call
 
-STEPS = tuple(10.0 ** (-1 - k / 2) for k in range(9))
+STEP_SIZES = tuple(10.0 ** (-1 - k / 2) for k in range(9))
 
 
-ONLY_IN_CONTACT = ("contact_stiffness", "shear_stiffness", "cone")
+CONTACT_PARAMETERS = ("contact_stiffness", "shear_stiffness", "cone")
 
 
-def parameters(cloth):
+def active_parameters(cloth):
     """Those that act: without contact the director's are not in the graph."""
     named = {name: value.detach() for name, value in cloth.named_parameters()}
     if cloth.contact is None:
-        named = {name: value for name, value in named.items() if not any(key in name for key in ONLY_IN_CONTACT)}
+        named = {name: value for name, value in named.items() if not any(key in name for key in CONTACT_PARAMETERS)}
     return named
 
 
@@ -21,6 +21,6 @@ def simulate(cloth, values, state, motion, times, **options):
     return functional_call(cloth, values, (state, motion, times), options)
 
 
-def sizes(values):
+def step_scales(values):
     """A coarse change: 1 for logarithms and angles, the value itself where that is smaller."""
     return {name: min(1.0, float(value.abs().mean())) or 1.0 for name, value in values.items()}

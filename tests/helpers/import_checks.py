@@ -4,7 +4,7 @@ import ast
 from collections.abc import Sequence
 
 VALIDATION = "torchcloth.training.validation"
-ALLOWED = (
+ALLOWED_PACKAGES = (
     "torchcloth.robots",
     "torchcloth.recordings",
     "torchcloth.observe",
@@ -15,7 +15,7 @@ ALLOWED = (
 )
 
 
-def forbidden_imports(source: str, package: str, allowed: Sequence[str] = ALLOWED) -> list[str]:
+def find_forbidden_imports(source: str, package: str, allowed: Sequence[str] = ALLOWED_PACKAGES) -> list[str]:
     """Return what a module of ``package`` imports of torchcloth, or might import by name, and may not.
 
     Relative imports are resolved. Dynamic imports count as forbidden, with a dot before their name.

@@ -11,14 +11,14 @@ from torch import Tensor
 
 from torchcloth.identification.estimators.levenberg_marquardt import DEFAULT_NOISE_MODEL, Linearised, Problem, minimise
 
-FRAMES, PATCHES, EACH = 40, 16, 3  # rows: 40 frames of 16 patches of 3 points
-SIGMA = 1e-3  # m
-TRUE = torch.tensor([0.4, -0.3, 0.7], dtype=torch.float64)
+FRAME_COUNT, PATCH_COUNT, POINTS_PER_PATCH = 40, 16, 3  # rows: 40 frames of 16 patches of 3 points
+SIGMA_M = 1e-3  # m
+TRUE_UNKNOWNS = torch.tensor([0.4, -0.3, 0.7], dtype=torch.float64)
 Model = Callable[[Tensor], Tensor]
 
 
 @dataclass
-class Toy:
+class ToyProblem:
     """``model(raw) - data``, with a log of what the solver asked for."""
 
     model: Model
@@ -26,7 +26,7 @@ class Toy:
     frame: Tensor
     patch: Tensor
     prior_std: float = 5.0
-    unknowns: int = len(TRUE)
+    unknowns: int = len(TRUE_UNKNOWNS)
     forbidden: Callable[[Tensor], Exception | None] = lambda raw: None
     linearised: list[Tensor] = field(default_factory=list)
     evaluated: list[Tensor] = field(default_factory=list)
@@ -59,50 +59,52 @@ class Toy:
         return self.model(raw) - self.data, self.patch
 
 
-def layout(frames: int = FRAMES) -> tuple[Tensor, Tensor]:
+def row_layout(frames: int = FRAME_COUNT) -> tuple[Tensor, Tensor]:
     """Frame and patch of every row; frame 0 has none, as in an episode."""
-    frame = torch.arange(1, frames + 1).repeat_interleave(PATCHES * EACH)
-    patch = torch.arange(PATCHES).repeat_interleave(EACH).repeat(frames)
+    frame = torch.arange(1, frames + 1).repeat_interleave(PATCH_COUNT * POINTS_PER_PATCH)
+    patch = torch.arange(PATCH_COUNT).repeat_interleave(POINTS_PER_PATCH).repeat(frames)
     return frame, patch
 
 
-def sensitivities(generator: torch.Generator, frames: int = FRAMES, unknowns: int = len(TRUE)) -> Tensor:
+def draw_jacobian(generator: torch.Generator, frames: int = FRAME_COUNT, unknowns: int = len(TRUE_UNKNOWNS)) -> Tensor:
     """[R, K] m: smooth over time and equal within a patch, as those of a fabric are."""
-    frame, patch = layout(frames)
-    phase, rate = torch.rand(2, PATCHES, unknowns, generator=generator, dtype=torch.float64)
-    t = frame[:, None] / FRAMES
+    frame, patch = row_layout(frames)
+    phase, rate = torch.rand(2, PATCH_COUNT, unknowns, generator=generator, dtype=torch.float64)
+    t = frame[:, None] / FRAME_COUNT
     return 2e-3 * torch.sin(2 * math.pi * (phase[patch] + (0.5 + rate[patch]) * t))
 
 
-def noise(generator: torch.Generator, shared: float, frames: int = FRAMES) -> Tensor:
+def draw_noise(generator: torch.Generator, shared: float, frames: int = FRAME_COUNT) -> Tensor:
     """[R] m: independent, and a part of ``shared`` times its size that a patch keeps over a window of frames.
 
     The windows begin two frames off those that the solver counts in: real errors do not know them.
     """
-    frame, patch = layout(frames)
+    frame, patch = row_layout(frames)
     window = (frame + 2) // DEFAULT_NOISE_MODEL.frames_per_time_block
-    common = torch.randn(int(window.max()) + 1, PATCHES, generator=generator, dtype=torch.float64)
+    common = torch.randn(int(window.max()) + 1, PATCH_COUNT, generator=generator, dtype=torch.float64)
     alone = torch.randn(len(frame), generator=generator, dtype=torch.float64)
-    return SIGMA * (alone + shared * common[window, patch])
+    return SIGMA_M * (alone + shared * common[window, patch])
 
 
-def linear(seed: int, shared: float = 0.0) -> tuple[Toy, Tensor]:
+def make_linear_problem(seed: int, shared: float = 0.0) -> tuple[ToyProblem, Tensor]:
     """A linear problem and its Jacobian."""
     generator = torch.Generator().manual_seed(seed)
-    jacobian = sensitivities(generator)
-    return Toy(lambda raw: jacobian @ raw, jacobian @ TRUE + noise(generator, shared), *layout()), jacobian
+    jacobian = draw_jacobian(generator)
+    return ToyProblem(
+        lambda raw: jacobian @ raw, jacobian @ TRUE_UNKNOWNS + draw_noise(generator, shared), *row_layout()
+    ), jacobian
 
 
-def curved(seed: int = 0, bend: float = 1.0) -> Toy:
+def make_curved_problem(seed: int = 0, bend: float = 1.0) -> ToyProblem:
     """Exponentials of the unknowns: a Jacobian that changes by a factor between start and solution."""
     generator = torch.Generator().manual_seed(seed)
-    jacobian = sensitivities(generator)
+    jacobian = draw_jacobian(generator)
     model = lambda raw: jacobian @ (torch.expm1(bend * raw) / bend)  # noqa: E731
-    return Toy(model, model(TRUE) + noise(generator, 0.0), *layout())
+    return ToyProblem(model, model(TRUE_UNKNOWNS) + draw_noise(generator, 0.0), *row_layout())
 
 
-START = torch.zeros(3, dtype=torch.float64)
+START_UNKNOWNS = torch.zeros(3, dtype=torch.float64)
 
 
-def solve(toy, iterations=35, start=START, **options):
+def solve(toy, iterations=35, start=START_UNKNOWNS, **options):
     return minimise(toy.problem(), start, iterations, lambda _: False, **options)

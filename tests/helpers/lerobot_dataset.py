@@ -11,21 +11,21 @@ from pathlib import Path
 
 import numpy as np
 
-FOLDER = Path(__file__).parents[1] / "recordings" / "formats" / "lerobot"
-FPS = 10
-LENGTHS = (6, 8)
-WIDTH, HEIGHT = 96, 64
-CAMERA = "observation.images.top"
-NAMES = [*(f"joint_{i}.pos" for i in range(1, 8)), "gripper.width"]
+LEROBOT_FOLDER = Path(__file__).parents[1] / "recordings" / "formats" / "lerobot"
+DATASET_RATE_HZ = 10
+EPISODE_LENGTHS = (6, 8)
+VIDEO_WIDTH_PX, VIDEO_HEIGHT_PX = 96, 64
+CAMERA_KEY = "observation.images.top"
+STATE_NAMES = [*(f"joint_{i}.pos" for i in range(1, 8)), "gripper.width"]
 
 
-def state(episode: int, frame: int) -> np.ndarray:
+def make_state(episode: int, frame: int) -> np.ndarray:
     """Joint angles [rad] and opening [m] of one frame, [8] float32."""
     q = 0.3 * np.sin(0.2 * frame + np.arange(7) + episode)
     return np.append(q, 0.04 - 0.005 * frame).astype(np.float32)
 
 
-def grey(episode: int, frame: int) -> int:
+def grey_level(episode: int, frame: int) -> int:
     """The grey level of one picture, which survives a lossy codec."""
     return 40 + 90 * episode + 10 * frame
 
@@ -34,25 +34,27 @@ def main() -> None:
     """Write the two episodes."""
     from lerobot.datasets.lerobot_dataset import LeRobotDataset  # pyright: ignore[reportMissingImports]
 
-    root = FOLDER / "dataset"
+    root = LEROBOT_FOLDER / "dataset"
     shutil.rmtree(root, ignore_errors=True)
-    vector = {"dtype": "float32", "shape": (8,), "names": NAMES}
-    image = {"dtype": "video", "shape": (HEIGHT, WIDTH, 3), "names": ["height", "width", "channels"]}
+    vector = {"dtype": "float32", "shape": (8,), "names": STATE_NAMES}
+    image = {"dtype": "video", "shape": (VIDEO_HEIGHT_PX, VIDEO_WIDTH_PX, 3), "names": ["height", "width", "channels"]}
     dataset = LeRobotDataset.create(
         repo_id="torchcloth/tiny",
-        fps=FPS,
+        fps=DATASET_RATE_HZ,
         root=root,
         robot_type="two_finger_arm",
-        features={"observation.state": vector, "action": vector, CAMERA: image},
+        features={"observation.state": vector, "action": vector, CAMERA_KEY: image},
         use_videos=True,
     )
-    for episode, length in enumerate(LENGTHS):
+    for episode, length in enumerate(EPISODE_LENGTHS):
         for frame in range(length):
             dataset.add_frame(
                 {
-                    "observation.state": state(episode, frame),
-                    "action": state(episode, frame + 1),
-                    CAMERA: np.full((HEIGHT, WIDTH, 3), grey(episode, frame), dtype=np.uint8),
+                    "observation.state": make_state(episode, frame),
+                    "action": make_state(episode, frame + 1),
+                    CAMERA_KEY: np.full(
+                        (VIDEO_HEIGHT_PX, VIDEO_WIDTH_PX, 3), grey_level(episode, frame), dtype=np.uint8
+                    ),
                     "task": "lift the cloth",
                 }
             )

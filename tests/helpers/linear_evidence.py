@@ -10,62 +10,70 @@ from torchcloth.diagnosis.inference.linearise import Linearisation
 from torchcloth.diagnosis.inference.noise import Noise, whiten
 from torchcloth.episodes.world import BaseParameter, Hypothesis, WorldModel
 
-EPISODES, PATCHES, WINDOWS = 4, 16, 6
-WHITE, SLOW, STD = 2e-4, 8e-4, 1.5e-3  # m
+EPISODE_COUNT, PATCH_COUNT, WINDOW_COUNT = 4, 16, 6
+WHITE_NOISE_M, SLOW_ERROR_M, NUISANCE_STD_M = 2e-4, 8e-4, 1.5e-3  # m
 
 
-def hypothesis(name: str, typical: float = 1.0, **options) -> Hypothesis:
+def make_hypothesis(name: str, typical: float = 1.0, **options) -> Hypothesis:
     return Hypothesis(name, "-", typical, lambda world, _: world, signed=True, **options)
 
 
-def parameter(name: str, std: float = 0.5) -> BaseParameter:
+def make_parameter(name: str, std: float = 0.5) -> BaseParameter:
     return BaseParameter(name, "-", 0.1, std, lambda world, _: world, lambda x: x)
 
 
-def grid() -> BinnedResiduals:
+def make_cells() -> BinnedResiduals:
     """One episode's cells without values: a square of 0.3 m in 4 x 4 parts."""
-    patch, window = (i.flatten() for i in torch.meshgrid(torch.arange(PATCHES), torch.arange(WINDOWS), indexing="ij"))
+    patch, window = (
+        i.flatten() for i in torch.meshgrid(torch.arange(PATCH_COUNT), torch.arange(WINDOW_COUNT), indexing="ij")
+    )
     place = torch.stack([(patch // 4) * 0.075, (patch % 4) * 0.075, torch.full(patch.shape, 0.01)], 1).double()
     size = len(patch)
     one = torch.ones(size).double()
     return BinnedResiduals(
-        torch.zeros(size).double(), torch.zeros(size, 0).double(), 25 * one, 5 * WHITE * one,
+        torch.zeros(size).double(), torch.zeros(size, 0).double(), 25 * one, 5 * WHITE_NOISE_M * one,
         torch.zeros(size).long(), 3 * patch, window, place, 0.2 * window.double(),
         torch.zeros(size).double(), torch.zeros(size).double(),
     )  # fmt: skip
 
 
-def smooth(seed: int, columns: int) -> torch.Tensor:
+def draw_jacobian(seed: int, columns: int) -> torch.Tensor:
     """[EPISODES, C, columns] m per unit, slopes that vary over centimetres and tenths of a second."""
     rng = torch.Generator().manual_seed(seed)
-    cells = grid()
+    cells = make_cells()
     basis = torch.cat([cells.rest_position[:, :2] / 0.3, cells.time[:, None]], 1)
-    waves = torch.randn(EPISODES, 3, columns, generator=rng).double() * 3
-    shift = 6.3 * torch.rand(EPISODES, 1, columns, generator=rng).double()
+    waves = torch.randn(EPISODE_COUNT, 3, columns, generator=rng).double() * 3
+    shift = 6.3 * torch.rand(EPISODE_COUNT, 1, columns, generator=rng).double()
     return 5e-3 * torch.sin(basis @ waves + shift)
 
 
-def evidence(slopes: torch.Tensor, own: int, names: list[str], truth: torch.Tensor, seed: int) -> Linearisation:
+def draw_linearisation(
+    slopes: torch.Tensor, own: int, names: list[str], truth: torch.Tensor, seed: int
+) -> Linearisation:
     """Residuals of a world in which ``truth`` [own + names] is what the model lacks; last column: a nuisance."""
     rng = torch.Generator().manual_seed(1000 + seed)
     level = torch.zeros(len(BLOCK_NAMES)).double()
-    level[0] = SLOW
+    level[0] = SLOW_ERROR_M
     cells, stds = [], []
     for own_slopes in slopes:
-        blank = grid()._replace(jacobian=own_slopes)
-        root = torch.linalg.cholesky(Noise(level).covariance(blank, own_slopes[:, -1:], torch.tensor([STD]).double()))
+        blank = make_cells()._replace(jacobian=own_slopes)
+        root = torch.linalg.cholesky(
+            Noise(level).covariance(blank, own_slopes[:, -1:], torch.tensor([NUISANCE_STD_M]).double())
+        )
         noise = root @ torch.randn(len(root), generator=rng).double()
         cells.append(blank._replace(value=noise - own_slopes[:, :-1] @ truth))
-        stds.append(torch.tensor([STD]).double())
-    found = [hypothesis(name) for name in names]
+        stds.append(torch.tensor([NUISANCE_STD_M]).double())
+    found = [make_hypothesis(name) for name in names]
     return Linearisation(cells, own, found, stds, [torch.zeros_like(c.value) for c in cells])
 
 
-def fitted(ev: Linearisation, level: float = SLOW, std: float = 0.5) -> ModelFit:
+def make_model_fit(ev: Linearisation, level: float = SLOW_ERROR_M, std: float = 0.5) -> ModelFit:
     """As ``fit`` leaves it, at the point where the evidence was gathered."""
     levels = torch.full((len(BLOCK_NAMES),), level).double()
     model = WorldModel(
-        None, tuple(parameter(f"p{k}", std) for k in range(ev.n_coordinates)), torch.zeros(ev.n_coordinates).double()
+        None,
+        tuple(make_parameter(f"p{k}", std) for k in range(ev.n_coordinates)),
+        torch.zeros(ev.n_coordinates).double(),
     )  # type: ignore[arg-type]
     white = whiten(ev, Noise(levels))
     own = white.jacobian[:, : ev.n_coordinates]

@@ -9,10 +9,10 @@ from __future__ import annotations
 import io
 from pathlib import Path
 
-FOLDER = Path(__file__).parents[1] / "recordings" / "formats" / "mcap"
-START = 1_700_000_000_000_000_000  # ns
+MCAP_FOLDER = Path(__file__).parents[1] / "recordings" / "formats" / "mcap"
+FIRST_POSE_NS = 1_700_000_000_000_000_000  # ns
 
-POSE = """std_msgs/Header header
+POSE_MESSAGE_DEFINITION = """std_msgs/Header header
 geometry_msgs/Pose pose
 ================================================================================
 MSG: std_msgs/Header
@@ -40,12 +40,12 @@ float64 w
 """
 
 
-def position(i: int) -> list[float]:
+def gripper_position(i: int) -> list[float]:
     """Of the gripper [m] at pose ``i``."""
     return [0.1 * i, -0.2, 0.3 + 0.01 * i]
 
 
-def write(path: Path, *, data_crcs: bool) -> None:
+def write_file(path: Path, *, data_crcs: bool) -> None:
     """Write one file; checksums of the whole data section are an option of the library, those of chunks are not."""
     from mcap.writer import CompressionType
     from mcap.writer import Writer as McapWriter
@@ -55,11 +55,11 @@ def write(path: Path, *, data_crcs: bool) -> None:
         writer = Writer(io.BytesIO())
         writer._writer = McapWriter(file, compression=CompressionType.ZSTD, enable_data_crcs=data_crcs)
         writer._writer.start(profile="ros2", library="torchcloth test")
-        schema = writer.register_msgdef("geometry_msgs/msg/PoseStamped", POSE)
+        schema = writer.register_msgdef("geometry_msgs/msg/PoseStamped", POSE_MESSAGE_DEFINITION)
         for i in range(5):
-            ns = START + 20_000_000 * i
+            ns = FIRST_POSE_NS + 20_000_000 * i
             stamp = {"sec": ns // 10**9, "nanosec": ns % 10**9}
-            x, y, z = position(i)
+            x, y, z = gripper_position(i)
             pose = {"position": {"x": x, "y": y, "z": z}, "orientation": {"x": 0.0, "y": 0.0, "z": 0.0, "w": 1.0}}
             message = {"header": {"stamp": stamp, "frame_id": "world"}, "pose": pose}
             writer.write_message("/hand", schema, message, log_time=ns, publish_time=ns, sequence=i)
@@ -67,5 +67,5 @@ def write(path: Path, *, data_crcs: bool) -> None:
 
 
 if __name__ == "__main__":
-    write(FOLDER / "chunk_crcs.mcap", data_crcs=False)
-    write(FOLDER / "all_crcs.mcap", data_crcs=True)
+    write_file(MCAP_FOLDER / "chunk_crcs.mcap", data_crcs=False)
+    write_file(MCAP_FOLDER / "all_crcs.mcap", data_crcs=True)

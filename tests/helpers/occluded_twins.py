@@ -17,55 +17,55 @@ from helpers import twins
 from torchcloth import recordings as rec
 from torchcloth.robots import replay
 
-WRONG = replace(twins.TRUE, membrane=0.5 * twins.TRUE.membrane, drag=0.5 * twins.TRUE.drag)
-SHARE = 0.3  # of the sheet that a bar hides while it passes
+WRONG_FABRIC = replace(twins.TRUE_FABRIC, membrane=0.5 * twins.TRUE_FABRIC.membrane, drag=0.5 * twins.TRUE_FABRIC.drag)
+BAR_WIDTH_FRACTION = 0.3  # of the sheet that a bar hides while it passes
 
 
 @dataclass(frozen=True, eq=False)
-class Scene:
+class OccludedTwin:
     recording: rec.Recording
     truth: Tensor  # [T, V, 3] m
     hidden: Tensor  # [T, V] bool, behind the bar
 
 
-def twin() -> Scene:
+def make_occluded_twin() -> OccludedTwin:
     """A shaken sheet behind a bar that passes once from one side to the other."""
-    whole, t = twins.twin(), np.arange(twins.FRAMES) / twins.RATE
-    x = _truth(t)
-    uv = np.asarray(tc.meshes.rectangle(twins.SIDE, twins.SIDE, resolution=twins.FIT).uv)
-    truth = np.stack([twins.bilinear(frame, twins.TRUTH, uv) for frame in x])
-    left = (1 - SHARE) * twins.SIDE * t / t[-1]  # of the bar, along the pattern's v
+    whole, t = twins.make_twin(), np.arange(twins.FRAME_COUNT) / twins.FRAME_RATE_HZ
+    x = _simulate_truth(t)
+    uv = np.asarray(tc.meshes.rectangle(twins.SIDE_M, twins.SIDE_M, resolution=twins.FIT_RESOLUTION).uv)
+    truth = np.stack([twins.interpolate_bilinear(frame, twins.TRUTH_RESOLUTION, uv) for frame in x])
+    left = (1 - BAR_WIDTH_FRACTION) * twins.SIDE_M * t / t[-1]  # of the bar, along the pattern's v
     clouds, kept = np.split(whole.points.xyz, np.cumsum(whole.points.counts)[:-1]), []
     for frame, cloud, start in zip(x, clouds, left, strict=True):
-        v = _across(frame, cloud)
-        kept.append(cloud[(v < start) | (v > start + SHARE * twins.SIDE)])
+        v = _pattern_v(frame, cloud)
+        kept.append(cloud[(v < start) | (v > start + BAR_WIDTH_FRACTION * twins.SIDE_M)])
     points = rec.PointClouds(t, np.concatenate(kept), np.array([len(cloud) for cloud in kept]))
-    hidden = (uv[:, 1] > left[:, None]) & (uv[:, 1] < left[:, None] + SHARE * twins.SIDE)
-    return Scene(replace(whole, points=points), torch.as_tensor(truth), torch.as_tensor(hidden))
+    hidden = (uv[:, 1] > left[:, None]) & (uv[:, 1] < left[:, None] + BAR_WIDTH_FRACTION * twins.SIDE_M)
+    return OccludedTwin(replace(whole, points=points), torch.as_tensor(truth), torch.as_tensor(hidden))
 
 
-def model(scene: Scene, fabric: twins.Fabric) -> tc.Cloth:
+def build_cloth(scene: OccludedTwin, fabric: twins.Fabric) -> tc.Cloth:
     """The cloth of the fit's mesh with some fabric's values."""
     values = {
-        "youngs_modulus": fabric.membrane / twins.THICKNESS,
+        "youngs_modulus": fabric.membrane / twins.THICKNESS_M,
         "poisson_ratio": fabric.poisson,
         "bending.stiffness": fabric.bending,
         "air.normal": fabric.drag,
     }
-    return twins.at(scene.recording, **values)
+    return twins.build_cloth_at(scene.recording, **values)
 
 
-def _truth(t: np.ndarray) -> np.ndarray:
-    """[T, V, 3] m on the truth's mesh, as ``twins.twin`` has it."""
-    truth, motion = twins.cloth(twins.TRUE, twins.TRUTH), twins.shake()
+def _simulate_truth(t: np.ndarray) -> np.ndarray:
+    """[T, V, 3] m on the truth's mesh, as ``twins.make_twin`` has it."""
+    truth, motion = twins.make_cloth(twins.TRUE_FABRIC, twins.TRUTH_RESOLUTION), twins.make_shaking_motion()
     empty = rec.Recording(cloth=rec.ClothInfo(areal_density=1.0), provenance="synthetic: twins.py", grippers=motion)
     with torch.no_grad():
         trajectories = replay(empty)
-        state = truth.settle(truth.state(twins.hammock(truth)), trajectories, duration=1.0, rate=15.0)
+        state = truth.settle(truth.state(twins.flat_positions(truth)), trajectories, duration=1.0, rate=15.0)
         return truth(state, trajectories, t.tolist(), dt=0.6 * truth.stable_step()).x.numpy()
 
 
-def _across(frame: np.ndarray, cloud: np.ndarray) -> np.ndarray:
+def _pattern_v(frame: np.ndarray, cloud: np.ndarray) -> np.ndarray:
     """[N] m, the pattern's v of the vertex that a point is nearest to."""
     near = np.linalg.norm(cloud[:, None] - frame, axis=-1).argmin(1)
-    return twins.SIDE * (near % twins.TRUTH[1]) / (twins.TRUTH[1] - 1)
+    return twins.SIDE_M * (near % twins.TRUTH_RESOLUTION[1]) / (twins.TRUTH_RESOLUTION[1] - 1)

@@ -9,13 +9,13 @@ import torchcloth as tc
 from torchcloth import recordings as rec
 from torchcloth.identification import build_cloth
 
-SIDE = 0.2  # m
-LASTS = 0.4  # s
-EDGE = np.stack([np.linspace(0.0, SIDE, 7), np.full(7, SIDE)], axis=-1)  # m
-NOMINAL = {"membrane_stiffness": 50.0, "poisson_ratio": 0.3, "bending_stiffness": 3e-5}
+SIDE_M = 0.2  # m
+DURATION_S = 0.4  # s
+UPPER_EDGE_M = np.stack([np.linspace(0.0, SIDE_M, 7), np.full(7, SIDE_M)], axis=-1)  # m
+NOMINAL_VALUES = {"membrane_stiffness": 50.0, "poisson_ratio": 0.3, "bending_stiffness": 3e-5}
 
 
-def sheet_of(x: np.ndarray, mesh: tc.meshes.Mesh) -> rec.ClothInfo:
+def describe_cloth(x: np.ndarray, mesh: tc.meshes.Mesh) -> rec.ClothInfo:
     return rec.ClothInfo(
         areal_density=0.3,
         thickness=1e-3,
@@ -23,27 +23,27 @@ def sheet_of(x: np.ndarray, mesh: tc.meshes.Mesh) -> rec.ClothInfo:
         faces=mesh.faces,
         uv=mesh.uv,
         initial_vertices=x,
-        nominal=NOMINAL,
+        nominal=NOMINAL_VALUES,
     )
 
 
-def _hung(corner: np.ndarray) -> tuple[np.ndarray, tc.meshes.Mesh]:
+def _hang_sheet(corner: np.ndarray) -> tuple[np.ndarray, tc.meshes.Mesh]:
     """(positions with the upper left corner there, the mesh)."""
-    mesh = tc.meshes.rectangle(SIDE, SIDE, triangles=72)
+    mesh = tc.meshes.rectangle(SIDE_M, SIDE_M, triangles=72)
     u, v = mesh.uv.T
-    return corner + np.stack([0 * u, u, v - SIDE], axis=-1), mesh
+    return corner + np.stack([0 * u, u, v - SIDE_M], axis=-1), mesh
 
 
-def by_hand(table: float | None = None) -> rec.Recording:
+def make_hand_episode(table: float | None = None) -> rec.Recording:
     """A free hand that moves 3 cm along x, over a table of that height."""
-    t = np.linspace(0.0, LASTS, 41)
-    x, mesh = _hung(np.array([0.0, 0.0, 0.5]))
-    s = t / LASTS
+    t = np.linspace(0.0, DURATION_S, 41)
+    x, mesh = _hang_sheet(np.array([0.0, 0.0, 0.5]))
+    s = t / DURATION_S
     place = np.array([0.0, 0.0, 0.5]) + np.stack([0.03 * (3 * s**2 - 2 * s**3), 0 * t, 0 * t], axis=-1)
     colliders = {} if table is None else {"table": rec.Collider(np.array([0, 0, table]), np.array([0.0, 0, 1]), 0.4)}
     return rec.Recording(
-        cloth=sheet_of(x, mesh),
-        grasps={"hand": rec.GraspInfo(uv=EDGE, radius=0.02)},
+        cloth=describe_cloth(x, mesh),
+        grasps={"hand": rec.GraspInfo(uv=UPPER_EDGE_M, radius=0.02)},
         grippers={"hand": rec.GripperMotion(t, place, np.tile([1.0, 0, 0, 0], (41, 1)), np.ones(41, bool))},
         colliders=colliders,
         air_density=1.204,
@@ -51,17 +51,17 @@ def by_hand(table: float | None = None) -> rec.Recording:
     )
 
 
-def by_arm() -> rec.Recording:
+def make_arm_episode() -> rec.Recording:
     """The arm of a Rizon 4 that turns its first joint by 0.05 rad and back."""
     arm = tc.robots.load("rizon4", frame="tcp_closed")
-    t = torch.linspace(0.0, LASTS, 41, dtype=torch.float64)
+    t = torch.linspace(0.0, DURATION_S, 41, dtype=torch.float64)
     q = arm.home.repeat(41, 1)
-    q[:, 0] += 0.025 * (1 - torch.cos(2 * torch.pi * t / LASTS))
+    q[:, 0] += 0.025 * (1 - torch.cos(2 * torch.pi * t / DURATION_S))
     corner = arm(arm.home)[:3, 3].numpy()
-    x, mesh = _hung(corner)
+    x, mesh = _hang_sheet(corner)
     return rec.Recording(
-        cloth=sheet_of(x, mesh),
-        grasps={"arm": rec.GraspInfo(uv=EDGE, radius=0.02)},
+        cloth=describe_cloth(x, mesh),
+        grasps={"arm": rec.GraspInfo(uv=UPPER_EDGE_M, radius=0.02)},
         joints={"arm": rec.JointMotion(t.numpy(), q.numpy(), closed=np.ones(41, bool))},
         robots={"arm": rec.RobotInfo("rizon4", np.eye(4), "tcp_closed")},
         air_density=1.204,
@@ -69,6 +69,6 @@ def by_arm() -> rec.Recording:
     )
 
 
-def cloth_of(recording: rec.Recording) -> tc.Cloth:
+def build_nominal_cloth(recording: rec.Recording) -> tc.Cloth:
     """At the data sheet's values."""
     return build_cloth(recording)

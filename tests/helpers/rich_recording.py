@@ -11,12 +11,12 @@ from PIL import Image
 from torchcloth import recordings as rec
 
 
-def compare(a, b, *, atol: float = 0.0, times: float = 0.0, at: str = "recording") -> None:
+def check_equal(a, b, *, atol: float = 0.0, times: float = 0.0, at: str = "recording") -> None:
     """Compare two bags of arrays field by field; ``atol`` is for points. Paths may differ, image bytes may not."""
     if is_dataclass(a):
         assert type(a) is type(b), at
         for f in fields(a):
-            compare(getattr(a, f.name), getattr(b, f.name), atol=atol, times=times, at=f"{at}.{f.name}")
+            check_equal(getattr(a, f.name), getattr(b, f.name), atol=atol, times=times, at=f"{at}.{f.name}")
     elif isinstance(a, np.ndarray):
         assert a.dtype == b.dtype, at
         allowed = {"xyz": atol if at.endswith("points.xyz") else 0.0, "t": times}.get(at.rpartition(".")[2], 0.0)
@@ -24,14 +24,14 @@ def compare(a, b, *, atol: float = 0.0, times: float = 0.0, at: str = "recording
     elif isinstance(a, dict):
         assert a.keys() == b.keys(), at
         for key in a:
-            compare(a[key], b[key], atol=atol, times=times, at=f"{at}.{key}")
+            check_equal(a[key], b[key], atol=atol, times=times, at=f"{at}.{key}")
     elif isinstance(a, tuple) and a and isinstance(a[0], Path):
         assert [p.read_bytes() for p in a] == [p.read_bytes() for p in b], at
     elif not at.endswith(".path"):
         assert a == b, at
 
 
-def transform(x: float) -> np.ndarray:
+def make_transform(x: float) -> np.ndarray:
     c, s = np.cos(0.7), np.sin(0.7)
     return np.array([[c, -s, 0, x], [s, c, 0, 0.1], [0, 0, 1, 0.2], [0, 0, 0, 1]], dtype=float)
 
@@ -100,15 +100,15 @@ def make_recording(tmp: Path) -> rec.Recording:
             "spare": rec.JointMotion(t[:3], rng.normal(size=(3, 6)), width=t[:3] * 0.05),
         },
         robots={
-            "right": rec.RobotInfo("rizon4", transform(0.5), "tcp_closed", {"serial": "A7"}),
-            "spare": rec.RobotInfo("homemade", transform(-0.5)),
+            "right": rec.RobotInfo("rizon4", make_transform(0.5), "tcp_closed", {"serial": "A7"}),
+            "spare": rec.RobotInfo("homemade", make_transform(-0.5)),
         },
         cameras={
             "cam0": rec.Camera(
                 width=8,
                 height=6,
                 K=np.array([[500.0, 0, 4], [0, 501, 3], [0, 0, 1]]),
-                T_world_camera=transform(1.0),
+                T_world_camera=make_transform(1.0),
                 distortion=np.array([0.1, -0.2, 1e-3, 2e-3]),
                 depth_scale=0.001,
                 **images,

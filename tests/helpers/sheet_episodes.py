@@ -16,14 +16,19 @@ from torchcloth.episodes.observed import build_episode as tensors
 from torchcloth.episodes.pattern_interpolation import interpolate_on_pattern, interpolation_weights
 from torchcloth.episodes.replay import Frames
 
-SIDE = 0.2  # m
-TRUTH, FIT = (13, 13), (7, 7)
-NOMINAL = {"membrane_stiffness": 60.0, "poisson_ratio": 0.3, "bending_stiffness": 2e-4, "bending_damping_time": 0.01}
-EYE = (0.1, -1.2, 1.1)  # m, of the camera
-FRAMES, RATE, POINTS, NOISE = 16, 20.0, 80, 5e-4  # -, Hz, a frame, m
+SIDE_M = 0.2  # m
+TRUTH_RESOLUTION, FIT_RESOLUTION = (13, 13), (7, 7)
+NOMINAL_VALUES = {
+    "membrane_stiffness": 60.0,
+    "poisson_ratio": 0.3,
+    "bending_stiffness": 2e-4,
+    "bending_damping_time": 0.01,
+}
+CAMERA_POSITION_M = (0.1, -1.2, 1.1)  # m, of the camera
+FRAME_COUNT, FRAME_RATE_HZ, POINTS_PER_FRAME, NOISE_M = 16, 20.0, 80, 5e-4  # -, Hz, a frame, m
 
 
-def swing(amplitude: float, rate: float, axis: int = 1) -> Callable[[np.ndarray], np.ndarray]:
+def make_swing(amplitude: float, rate: float, axis: int = 1) -> Callable[[np.ndarray], np.ndarray]:
     """Displacement [K, 3] m of both grippers."""
 
     def moved(t: np.ndarray) -> np.ndarray:
@@ -34,20 +39,22 @@ def swing(amplitude: float, rate: float, axis: int = 1) -> Callable[[np.ndarray]
     return moved
 
 
-MOTIONS = {"slow": swing(0.06, 1.2), "fast": swing(0.10, 1.6), "lift": swing(0.05, 2.0, axis=2)}
+MOTIONS = {"slow": make_swing(0.06, 1.2), "fast": make_swing(0.10, 1.6), "lift": make_swing(0.05, 2.0, axis=2)}
 
 
-def episode(motion: str = "slow", resolution: tuple[int, int] = FIT, duration: float = 0.3) -> rec.Recording:
+def make_episode(
+    motion: str = "slow", resolution: tuple[int, int] = FIT_RESOLUTION, duration: float = 0.3
+) -> rec.Recording:
     """Without anything seen of it but points on its first shape."""
-    mesh = tc.meshes.rectangle(SIDE, SIDE, resolution=resolution)
+    mesh = tc.meshes.rectangle(SIDE_M, SIDE_M, resolution=resolution)
     t, rng = np.linspace(0.0, duration, 2 + int(50 * duration)), np.random.default_rng(0)
     first = np.c_[mesh.uv[:, 0], 0.01 * np.sin(8 * mesh.uv[:, 0]), mesh.uv[:, 1]] + [0.0, 0.0, 1.0]
     grippers, grasps = {}, {}
-    for name, u in (("left", 0.0), ("right", SIDE)):
-        path = MOTIONS[motion](t) + np.array([u, 0.0, 1.0 + SIDE])
+    for name, u in (("left", 0.0), ("right", SIDE_M)):
+        path = MOTIONS[motion](t) + np.array([u, 0.0, 1.0 + SIDE_M])
         grippers[name] = rec.GripperMotion(t, path, np.tile([1.0, 0, 0, 0], (len(t), 1)), np.ones(len(t), bool))
-        grasps[name] = rec.GraspInfo(np.array([[u, SIDE]]), 0.051)
-    frames = 1 + int(duration * RATE)
+        grasps[name] = rec.GraspInfo(np.array([[u, SIDE_M]]), 0.051)
+    frames = 1 + int(duration * FRAME_RATE_HZ)
     points = first[rng.integers(0, len(first), (frames, 40))] + 1e-3 * rng.standard_normal((frames, 40, 3))
     info = rec.ClothInfo(
         areal_density=0.2,
@@ -57,34 +64,39 @@ def episode(motion: str = "slow", resolution: tuple[int, int] = FIT, duration: f
         faces=mesh.faces,
         uv=mesh.uv,
         initial_vertices=first,
-        nominal=NOMINAL,
+        nominal=NOMINAL_VALUES,
     )
     return rec.Recording(
         cloth=info,
         provenance="synthetic: tests/diagnosis/sheets.py",
         grasps=grasps,
         grippers=grippers,
-        points=rec.PointClouds(np.arange(frames) / RATE, points.reshape(-1, 3), np.full(frames, 40)),
+        points=rec.PointClouds(np.arange(frames) / FRAME_RATE_HZ, points.reshape(-1, 3), np.full(frames, 40)),
         observation_noise_std=1e-3,
-        cameras={"camera": rec.Camera(width=640, height=480, K=np.eye(3), T_world_camera=_at(EYE))},
+        cameras={
+            "camera": rec.Camera(width=640, height=480, K=np.eye(3), T_world_camera=_camera_pose(CAMERA_POSITION_M))
+        },
         split={"motion": motion},
     )
 
 
-def _at(place: tuple[float, float, float]) -> np.ndarray:
+def _camera_pose(place: tuple[float, float, float]) -> np.ndarray:
     pose = np.eye(4)
     pose[:3, 3] = place
     return pose
 
 
-def recorded(
+def record_changed_world(
     motion: str,
     change: Callable[[World], World],
     seed: int,
     play: Callable[[World, Episode], Frames] = World.simulate_observed,
 ) -> rec.Recording:
     """What a noisy sensor has of a world that is changed, played on a finer mesh; the first shape is settled."""
-    blank, rng = episode(motion, TRUTH, (FRAMES - 1) / RATE + 0.01), np.random.default_rng(seed)
+    blank, rng = (
+        make_episode(motion, TRUTH_RESOLUTION, (FRAME_COUNT - 1) / FRAME_RATE_HZ + 0.01),
+        np.random.default_rng(seed),
+    )
     plain = build_base_model(blank).build_world()
     world, even = change(plain), np.asarray(blank.cloth.uv)
     with torch.no_grad():
@@ -94,24 +106,30 @@ def recorded(
         settled = replace(blank, cloth=replace(blank.cloth, initial_vertices=start.numpy()))
         found = play(world, tensors(world.cloth, settled))
         x = interpolate_on_pattern(interpolation_weights(plain.cloth.mesh, even), found.x).numpy()
-    coarse = episode(motion, FIT, (FRAMES - 1) / RATE + 0.01)
-    clouds = [_seen(frame, rng) for frame in x]
-    first = _bilinear(x[0], np.asarray(coarse.cloth.uv)) + 2e-4 * rng.standard_normal((len(coarse.cloth.uv), 3))
+    coarse = make_episode(motion, FIT_RESOLUTION, (FRAME_COUNT - 1) / FRAME_RATE_HZ + 0.01)
+    clouds = [_sample_points(frame, rng) for frame in x]
+    first = _interpolate_bilinear(x[0], np.asarray(coarse.cloth.uv)) + 2e-4 * rng.standard_normal(
+        (len(coarse.cloth.uv), 3)
+    )
     return replace(
         coarse,
         cloth=replace(coarse.cloth, initial_vertices=first),
-        points=rec.PointClouds(np.arange(FRAMES) / RATE, np.concatenate(clouds), np.full(FRAMES, POINTS)),
-        observation_noise_std=NOISE,
+        points=rec.PointClouds(
+            np.arange(FRAME_COUNT) / FRAME_RATE_HZ, np.concatenate(clouds), np.full(FRAME_COUNT, POINTS_PER_FRAME)
+        ),
+        observation_noise_std=NOISE_M,
     )
 
 
-def _seen(x: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    return _bilinear(x, SIDE * rng.random((POINTS, 2))) + NOISE * rng.standard_normal((POINTS, 3))
+def _sample_points(x: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    return _interpolate_bilinear(x, SIDE_M * rng.random((POINTS_PER_FRAME, 2))) + NOISE_M * rng.standard_normal(
+        (POINTS_PER_FRAME, 3)
+    )
 
 
-def _bilinear(x: np.ndarray, uv: np.ndarray) -> np.ndarray:
-    columns, rows = TRUTH
-    place = np.clip(uv / SIDE, 0, 1) * [columns - 1, rows - 1]
+def _interpolate_bilinear(x: np.ndarray, uv: np.ndarray) -> np.ndarray:
+    columns, rows = TRUTH_RESOLUTION
+    place = np.clip(uv / SIDE_M, 0, 1) * [columns - 1, rows - 1]
     cell = np.minimum(place.astype(int), [columns - 2, rows - 2])
     a, b = (place - cell).T[:, :, None]
     first = cell[:, 0] * rows + cell[:, 1]

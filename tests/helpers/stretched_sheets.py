@@ -16,14 +16,14 @@ from torchcloth.episodes.unknowns import find_scalar_parameters
 from torchcloth.robots import replay
 from torchcloth.training.studies.synthetic_sheets import interpolate_on_grid, simulate_readings
 
-WIDTH, HEIGHT = 0.30, 0.20  # m, between the jaws and along them
-THICKNESS = 1e-3  # m
-TRUTH, FIT = (22, 15), (13, 9)  # vertices
-POINTS = 400  # a frame, before occlusion
-FORCE_NOISE = 0.02  # N, white, at the knots
-KNOTS = 50.0  # 1/s
-FRAMES, RATE = 16, 15.0
-FACING = np.array([0.0, 0.0, 1.0])  # the camera looks along it
+WIDTH_M, HEIGHT_M = 0.30, 0.20  # m, between the jaws and along them
+THICKNESS_M = 1e-3  # m
+TRUTH_RESOLUTION, FIT_RESOLUTION = (22, 15), (13, 9)  # vertices
+POINTS_PER_FRAME = 400  # a frame, before occlusion
+FORCE_NOISE_N = 0.02  # N, white, at the knots
+KNOT_RATE_HZ = 50.0  # 1/s
+FRAME_COUNT, FRAME_RATE_HZ = 16, 15.0
+VIEWING_DIRECTION = np.array([0.0, 0.0, 1.0])  # the camera looks along it
 
 
 @dataclass(frozen=True)
@@ -38,7 +38,7 @@ class Fabric:
 
 
 @dataclass(frozen=True)
-class Setting:
+class EpisodeSettings:
     """How it is pulled and seen."""
 
     strain: float = 0.06
@@ -49,138 +49,145 @@ class Setting:
     grasp: float = 0.5e-3  # m, error of the first shape at each jaw, and linearly between them
     initial: float = 0.2e-3  # m, more of it at every free vertex
     clock: float = 0.0  # s
-    resolution: tuple[int, int] = TRUTH
-    points: int = POINTS
-    frames: int = FRAMES
-    rate: float = RATE  # 1/s
+    resolution: tuple[int, int] = TRUTH_RESOLUTION
+    points: int = POINTS_PER_FRAME
+    frames: int = FRAME_COUNT
+    rate: float = FRAME_RATE_HZ  # 1/s
 
 
-def cloth(fabric: Fabric, resolution: tuple[int, int]) -> tc.Cloth:
+def make_cloth(fabric: Fabric, resolution: tuple[int, int]) -> tc.Cloth:
     """The sheet, its two short sides in jaws."""
-    mesh = tc.meshes.rectangle(WIDTH, HEIGHT, resolution=resolution)
+    mesh = tc.meshes.rectangle(WIDTH_M, HEIGHT_M, resolution=resolution)
     effects = {
         "gravity": tc.effects.Gravity(),
         "bending": tc.effects.Bending(fabric.bending, 5e-3),
         "air": tc.effects.AirDrag(fabric.drag),
     }
-    material = tc.materials.AEP(fabric.membrane / THICKNESS, fabric.poisson, thickness=THICKNESS)
-    grasps = {name: tc.boundaries.Grasp(uv=jaw(name), radius=RADIUS) for name in SIDES}
+    material = tc.materials.AEP(fabric.membrane / THICKNESS_M, fabric.poisson, thickness=THICKNESS_M)
+    grasps = {name: tc.boundaries.Grasp(uv=jaw_points(name), radius=GRASP_RADIUS_M) for name in GRASPED_SIDES_U_M}
     return tc.Cloth(mesh, material, fabric.density, effects, grasps, contact=None)
 
 
-SIDES = {"left": 0.0, "right": WIDTH}
-RADIUS = 0.006  # m
+GRASPED_SIDES_U_M = {"left": 0.0, "right": WIDTH_M}
+GRASP_RADIUS_M = 0.006  # m
 
 
-def jaw(name: str) -> np.ndarray:
+def jaw_points(name: str) -> np.ndarray:
     """[41, 2] m, pattern points along a side."""
-    along = np.linspace(0.0, HEIGHT, 41)
-    return np.stack([np.full_like(along, SIDES[name]), along], axis=1)
+    along = np.linspace(0.0, HEIGHT_M, 41)
+    return np.stack([np.full_like(along, GRASPED_SIDES_U_M[name]), along], axis=1)
 
 
-def pull(setting: Setting) -> dict[str, rec.GripperMotion]:
+def make_pulling_motion(setting: EpisodeSettings) -> dict[str, rec.GripperMotion]:
     """Apart and back once, up and down twice."""
     end = (setting.frames - 1) / setting.rate + 0.2
-    t = np.arange(0.0, end, 1 / KNOTS)
+    t = np.arange(0.0, end, 1 / KNOT_RATE_HZ)
     part = 0.01 + 0.5 * setting.strain * (1 - np.cos(2 * np.pi * np.clip(t, 0, 1.0)))
     lift = 0.5 * setting.heave * (1 - np.cos(2 * np.pi * 2.0 * np.clip(t, 0, 1.0)))
     out = {}
-    for name, u in SIDES.items():
-        x = (u - WIDTH / 2) * (1 + part)
+    for name, u in GRASPED_SIDES_U_M.items():
+        x = (u - WIDTH_M / 2) * (1 + part)
         position = np.stack([x, 0 * t, 1.0 + lift], axis=1)
         out[name] = rec.GripperMotion(t, position, np.tile([1.0, 0, 0, 0], (len(t), 1)), np.ones(len(t), bool))
     return out
 
 
-def flat(mesh: tc.meshes.Mesh) -> torch.Tensor:
+def flat_positions(mesh: tc.meshes.Mesh) -> torch.Tensor:
     """[V, 3] m, taut between the jaws at the first knot."""
     u, v = torch.as_tensor(mesh.uv).T
-    return torch.stack([1.01 * (u - WIDTH / 2), v - HEIGHT / 2, torch.ones_like(u)], dim=-1)
+    return torch.stack([1.01 * (u - WIDTH_M / 2), v - HEIGHT_M / 2, torch.ones_like(u)], dim=-1)
 
 
-def at(x: np.ndarray, shape: tuple[int, int], uv: np.ndarray) -> np.ndarray:
+def interpolate(x: np.ndarray, shape: tuple[int, int], uv: np.ndarray) -> np.ndarray:
     """Positions [N, 3] m of material points on a grid of vertices."""
-    return interpolate_on_grid(x, shape, uv / [WIDTH, HEIGHT])
+    return interpolate_on_grid(x, shape, uv / [WIDTH_M, HEIGHT_M])
 
 
-def record(
-    fabric: Fabric | None = None, seed: int = 0, setting: Setting | None = None, markers: int = 0
+def record_episode(
+    fabric: Fabric | None = None, seed: int = 0, setting: EpisodeSettings | None = None, markers: int = 0
 ) -> rec.Recording:
     """One episode: clouds, forces, and a noisy first shape on the model's mesh; ``markers`` a side where asked for."""
-    fabric, setting = fabric or Fabric(), setting or Setting()
+    fabric, setting = fabric or Fabric(), setting or EpisodeSettings()
     rng = np.random.default_rng(seed)
-    truth, mesh = cloth(fabric, setting.resolution), tc.meshes.rectangle(WIDTH, HEIGHT, resolution=FIT)
-    motion = pull(setting)
+    truth, mesh = (
+        make_cloth(fabric, setting.resolution),
+        tc.meshes.rectangle(WIDTH_M, HEIGHT_M, resolution=FIT_RESOLUTION),
+    )
+    motion = make_pulling_motion(setting)
     bare = rec.Recording(cloth=rec.ClothInfo(areal_density=1.0), provenance="synthetic: stretches.py", grippers=motion)
     knots = motion["left"].t
     frames = np.arange(setting.frames) / setting.rate
     times = np.union1d(knots[knots <= frames[-1] + 0.15], frames + setting.clock)
     with torch.no_grad():
         moves = replay(bare)
-        state = truth.settle(truth.state(flat(truth.mesh)), moves, duration=0.6)
+        state = truth.settle(truth.state(flat_positions(truth.mesh)), moves, duration=0.6)
         out = truth(state, moves, times.tolist(), dt=0.6 * truth.stable_step())
-    forces = {name: simulate_readings(out, name, knots, FORCE_NOISE, rng) for name in motion}
+    forces = {name: simulate_readings(out, name, knots, FORCE_NOISE_N, rng) for name in motion}
     x = out.x[np.searchsorted(times, frames + setting.clock)].numpy()
-    clouds = [_cloud(frame, setting, rng) for frame in x]
-    first = at(out.x[0].numpy(), setting.resolution, np.asarray(mesh.uv))
+    clouds = [_sample_cloud(frame, setting, rng) for frame in x]
+    first = interpolate(out.x[0].numpy(), setting.resolution, np.asarray(mesh.uv))
     return rec.Recording(
         cloth=rec.ClothInfo(
             areal_density=fabric.density,
             areal_density_std=0.005,
-            thickness=THICKNESS,
+            thickness=THICKNESS_M,
             vertices=mesh.vertices,
             faces=mesh.faces,
             uv=mesh.uv,
-            initial_vertices=first + _first_error(np.asarray(mesh.uv), setting, rng),
+            initial_vertices=first + _draw_first_error(np.asarray(mesh.uv), setting, rng),
         ),
         provenance="synthetic: tests/identification/stretches.py",
-        grasps={name: rec.GraspInfo(jaw(name), RADIUS) for name in SIDES},
+        grasps={name: rec.GraspInfo(jaw_points(name), GRASP_RADIUS_M) for name in GRASPED_SIDES_U_M},
         grippers={name: replace(m, force=forces[name]) for name, m in motion.items()},
         points=rec.PointClouds(frames, np.concatenate(clouds), np.array([len(c) for c in clouds])),
-        markers=_markers(x, frames, markers, setting, rng) if markers else None,
+        markers=_make_markers(x, frames, markers, setting, rng) if markers else None,
         observation_noise_std=setting.depth,
         air_density=1.204,
     )
 
 
-def _cloud(x: np.ndarray, setting: Setting, rng: np.random.Generator) -> np.ndarray:
-    uv = rng.random((setting.points, 2)) * [WIDTH, HEIGHT]
-    hidden = np.abs(uv[:, 0] / WIDTH - 0.62) < 0.5 * setting.occluded
-    points = at(x, setting.resolution, uv[~hidden])
+def _sample_cloud(x: np.ndarray, setting: EpisodeSettings, rng: np.random.Generator) -> np.ndarray:
+    uv = rng.random((setting.points, 2)) * [WIDTH_M, HEIGHT_M]
+    hidden = np.abs(uv[:, 0] / WIDTH_M - 0.62) < 0.5 * setting.occluded
+    points = interpolate(x, setting.resolution, uv[~hidden])
     noise = rng.standard_normal(points.shape)
-    return points + noise * (setting.lateral * (1 - FACING) + setting.depth * FACING)
+    return points + noise * (setting.lateral * (1 - VIEWING_DIRECTION) + setting.depth * VIEWING_DIRECTION)
 
 
-def _first_error(uv: np.ndarray, setting: Setting, rng: np.random.Generator) -> np.ndarray:
+def _draw_first_error(uv: np.ndarray, setting: EpisodeSettings, rng: np.random.Generator) -> np.ndarray:
     """[V, 3] m: as a shape that was fitted to an image is off, smoothly."""
-    share = uv[:, :1] / WIDTH
+    share = uv[:, :1] / WIDTH_M
     left, right = setting.grasp * rng.standard_normal((2, 3))
-    free = (uv[:, :1] > 1e-6) & (uv[:, :1] < WIDTH - 1e-6)
+    free = (uv[:, :1] > 1e-6) & (uv[:, :1] < WIDTH_M - 1e-6)
     return (1 - share) * left + share * right + setting.initial * free * rng.standard_normal((len(uv), 3))
 
 
-def _markers(x: np.ndarray, t: np.ndarray, side: int, setting: Setting, rng: np.random.Generator) -> rec.Markers:
+def _make_markers(
+    x: np.ndarray, t: np.ndarray, side: int, setting: EpisodeSettings, rng: np.random.Generator
+) -> rec.Markers:
     """A grid of material points, a fifth of the sightings lost."""
-    u, v = np.meshgrid(np.linspace(0.1, 0.9, side) * WIDTH, np.linspace(0.1, 0.9, side) * HEIGHT)
+    u, v = np.meshgrid(np.linspace(0.1, 0.9, side) * WIDTH_M, np.linspace(0.1, 0.9, side) * HEIGHT_M)
     uv = np.stack([u.ravel(), v.ravel()], axis=1)
-    xyz = np.stack([at(frame, setting.resolution, uv) for frame in x])
+    xyz = np.stack([interpolate(frame, setting.resolution, uv) for frame in x])
     xyz += 0.3e-3 * rng.standard_normal(xyz.shape)
     xyz[rng.random(xyz.shape[:2]) < 0.2] = np.nan
     return rec.Markers(t, xyz, uv)
 
 
-def remeshed(recording: rec.Recording, resolution: tuple[int, int]) -> rec.Recording:
+def remesh_recording(recording: rec.Recording, resolution: tuple[int, int]) -> rec.Recording:
     """The same episode on another mesh of the model: its first shape is interpolated."""
-    mesh = tc.meshes.rectangle(WIDTH, HEIGHT, resolution=resolution)
+    mesh = tc.meshes.rectangle(WIDTH_M, HEIGHT_M, resolution=resolution)
     info = recording.cloth
-    first = at(info.initial_vertices, FIT, np.asarray(mesh.uv))
+    first = interpolate(info.initial_vertices, FIT_RESOLUTION, np.asarray(mesh.uv))
     info = replace(info, vertices=mesh.vertices, faces=mesh.faces, uv=mesh.uv, initial_vertices=first)
     return replace(recording, cloth=info)
 
 
-def model(recording: rec.Recording, resolution: tuple[int, int] = FIT, **start: float) -> tc.Cloth:
+def build_start_cloth(
+    recording: rec.Recording, resolution: tuple[int, int] = FIT_RESOLUTION, **start: float
+) -> tc.Cloth:
     """The cloth of an episode with some start values, by default wrong ones."""
-    found = cloth(Fabric(membrane=150.0, poisson=0.2, density=recording.cloth.areal_density), resolution)
+    found = make_cloth(Fabric(membrane=150.0, poisson=0.2, density=recording.cloth.areal_density), resolution)
     for name, value in start.items():
         found.get_submodule(find_scalar_parameters(found)[name]).set(value)
     return found

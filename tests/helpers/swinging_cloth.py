@@ -4,10 +4,10 @@ import numpy as np
 
 from torchcloth import recordings as rec
 
-SIDE, NODES = 0.3, 8
+SIDE_M, NODES_PER_SIDE = 0.3, 8
 
 
-def path(t):
+def gripper_path(t):
     """Gripper position [T, 3] m: 1.5 s of rest, 4 s of strokes that are never alike, rest."""
     s = np.clip(t - 1.5, 0, 4)
     envelope = np.sin(np.pi * s / 4) ** 2
@@ -15,45 +15,45 @@ def path(t):
     return np.stack([0 * t, y, 0.5 + 0.05 * envelope], -1)
 
 
-def shape(t, nodes=NODES):
+def node_positions(t, nodes=NODES_PER_SIDE):
     """Nodes [T, M, 3] m of the cloth, rows from the top; columns are straight, and lean with the motion."""
-    u, v = np.meshgrid(np.linspace(0, SIDE, nodes), np.linspace(0, SIDE, nodes))
-    lean = 0.6 * np.gradient(path(t)[:, 1], t) if len(t) > 1 else np.zeros(1)
+    u, v = np.meshgrid(np.linspace(0, SIDE_M, nodes), np.linspace(0, SIDE_M, nodes))
+    lean = 0.6 * np.gradient(gripper_path(t)[:, 1], t) if len(t) > 1 else np.zeros(1)
     down = np.stack([np.zeros_like(lean), -np.sin(lean), -np.cos(lean)], -1)
     across = np.array([1.0, 0.0, 0.0])
-    return path(t)[:, None] + (u.ravel() - SIDE / 2)[:, None] * across + v.ravel()[:, None] * down[:, None]
+    return gripper_path(t)[:, None] + (u.ravel() - SIDE_M / 2)[:, None] * across + v.ravel()[:, None] * down[:, None]
 
 
-def pattern():
-    u, v = np.meshgrid(np.linspace(0, SIDE, NODES), np.linspace(0, SIDE, NODES))
-    return np.stack([u.ravel(), SIDE - v.ravel()], -1)
+def node_pattern():
+    u, v = np.meshgrid(np.linspace(0, SIDE_M, NODES_PER_SIDE), np.linspace(0, SIDE_M, NODES_PER_SIDE))
+    return np.stack([u.ravel(), SIDE_M - v.ravel()], -1)
 
 
-def motion(rate=50.0, length=8.0):
+def make_motion(rate=50.0, length=8.0):
     t = np.arange(0, length, 1 / rate)
-    return rec.GripperMotion(t, path(t), np.tile([1.0, 0, 0, 0], (len(t), 1)), np.ones(len(t), bool))
+    return rec.GripperMotion(t, gripper_path(t), np.tile([1.0, 0, 0, 0], (len(t), 1)), np.ones(len(t), bool))
 
 
-def episode(**streams):
-    cloth = rec.ClothInfo(areal_density=0.2, sheet=(SIDE, SIDE))
-    return rec.Recording(cloth=cloth, grippers={"hand": motion()}, provenance="synthetic: tests", **streams)
+def make_episode(**streams):
+    cloth = rec.ClothInfo(areal_density=0.2, sheet=(SIDE_M, SIDE_M))
+    return rec.Recording(cloth=cloth, grippers={"hand": make_motion()}, provenance="synthetic: tests", **streams)
 
 
-def markers(noise=0.002, lag=0.0, rate=12.0, seed=0, **extra):
+def make_markers(noise=0.002, lag=0.0, rate=12.0, seed=0, **extra):
     """Markers at even times, stamped ``lag`` s late."""
     t = np.arange(0.2, 7.2, 1 / rate)
-    xyz = shape(t) + noise * np.random.default_rng(seed).standard_normal((len(t), NODES**2, 3))
+    xyz = node_positions(t) + noise * np.random.default_rng(seed).standard_normal((len(t), NODES_PER_SIDE**2, 3))
     return rec.Markers(t + lag, xyz, **extra)
 
 
-def clouds(noise=0.002, lag=0.0, rate=12.0, count=600, seed=0):
+def make_clouds(noise=0.002, lag=0.0, rate=12.0, count=600, seed=0):
     """Points strewn over the cloth, with noise along its normal."""
     rng = np.random.default_rng(seed)
     t = np.arange(0.2, 7.2, 1 / rate)
-    corners = shape(t, 2).reshape(len(t), 2, 2, 3)
+    corners = node_positions(t, 2).reshape(len(t), 2, 2, 3)
     frames = []
     for (a, b), (c, _) in corners:
         u, v = rng.random((2, count, 1))
-        normal = np.cross(b - a, c - a) / SIDE**2
+        normal = np.cross(b - a, c - a) / SIDE_M**2
         frames.append(a + u * (b - a) + v * (c - a) + noise * rng.standard_normal((count, 1)) * normal)
     return rec.PointClouds(t + lag, np.concatenate(frames), np.full(len(t), count))

@@ -12,7 +12,7 @@ from torch import Tensor
 import torchcloth as tc
 from torchcloth.dynamics import substep
 
-TOLERANCE = 1e-9  # of the largest force on a vertex, relative to the pull
+RELATIVE_FORCE_TOLERANCE = 1e-9  # of the largest force on a vertex, relative to the pull
 
 
 @dataclass
@@ -86,7 +86,7 @@ class Strip:
             for _ in range(30):
                 gradient, second = self._derivatives(x)
                 force = gradient.unflatten(-1, (-1, 2))[:, self.right, 0].sum(-1)
-                if float(gradient[:, self.free].abs().max()) < TOLERANCE * float(force.abs().max()):
+                if float(gradient[:, self.free].abs().max()) < RELATIVE_FORCE_TOLERANCE * float(force.abs().max()):
                     self.start = x
                     return force, x
                 step = torch.zeros_like(gradient)

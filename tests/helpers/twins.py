@@ -19,15 +19,15 @@ from torchcloth import recordings as rec
 from torchcloth.episodes.unknowns import find_scalar_parameters
 from torchcloth.robots import replay
 
-SIDE = 0.3  # m
-THICKNESS = 1e-3  # m
-EDGES = {"left": 0.0, "right": SIDE}  # u of the edge that each gripper's jaw holds in its whole length
-JAW = np.linspace(0.0, SIDE, 61)
-RADIUS = 0.0018  # m, holds the edge's vertices and no others, of any mesh used here
-TRUTH, FIT = (11, 11), (7, 7)  # vertices along the sides
-NOISE = 1e-3  # m
-FRAMES, RATE = 15, 20.0  # 0.7 s
-POINTS = 120  # a frame
+SIDE_M = 0.3  # m
+THICKNESS_M = 1e-3  # m
+GRASPED_EDGES_U_M = {"left": 0.0, "right": SIDE_M}  # u of the edge that each gripper's jaw holds in its whole length
+JAW_V_M = np.linspace(0.0, SIDE_M, 61)
+GRASP_RADIUS_M = 0.0018  # m, holds the edge's vertices and no others, of any mesh used here
+TRUTH_RESOLUTION, FIT_RESOLUTION = (11, 11), (7, 7)  # vertices along the sides
+NOISE_M = 1e-3  # m
+FRAME_COUNT, FRAME_RATE_HZ = 15, 20.0  # 0.7 s
+POINTS_PER_FRAME = 120  # a frame
 
 
 @dataclass(frozen=True)
@@ -42,48 +42,50 @@ class Fabric:
     drag: float = 1.2
 
 
-TRUE = Fabric()
-NOMINAL = Fabric(membrane=80.0, poisson=0.15)  # the data sheet's values: a start that is wrong
+TRUE_FABRIC = Fabric()
+NOMINAL_FABRIC = Fabric(membrane=80.0, poisson=0.15)  # the data sheet's values: a start that is wrong
 
 
-def cloth(fabric: Fabric, resolution: tuple[int, int], drag: bool = True) -> tc.Cloth:
+def make_cloth(fabric: Fabric, resolution: tuple[int, int], drag: bool = True) -> tc.Cloth:
     """The sheet in two grippers."""
     effects = {"gravity": tc.effects.Gravity(), "bending": tc.effects.Bending(fabric.bending, fabric.damping_time)}
     if drag:
         effects["air"] = tc.effects.AirDrag(fabric.drag)
-    material = tc.materials.AEP(fabric.membrane / THICKNESS, fabric.poisson, thickness=THICKNESS)
-    grasps = {name: tc.boundaries.Grasp(uv=jaw(name), radius=RADIUS) for name in EDGES}
-    mesh = tc.meshes.rectangle(SIDE, SIDE, resolution=resolution)
+    material = tc.materials.AEP(fabric.membrane / THICKNESS_M, fabric.poisson, thickness=THICKNESS_M)
+    grasps = {name: tc.boundaries.Grasp(uv=jaw_points(name), radius=GRASP_RADIUS_M) for name in GRASPED_EDGES_U_M}
+    mesh = tc.meshes.rectangle(SIDE_M, SIDE_M, resolution=resolution)
     return tc.Cloth(mesh, material, fabric.density, effects, grasps, contact=None)
 
 
-def jaw(name: str) -> np.ndarray:
+def jaw_points(name: str) -> np.ndarray:
     """[61, 2] m, pattern points along an edge."""
-    return np.stack([np.full_like(JAW, EDGES[name]), JAW], axis=1)
+    return np.stack([np.full_like(JAW_V_M, GRASPED_EDGES_U_M[name]), JAW_V_M], axis=1)
 
 
-def shake(amplitude: float = 0.08, rate: float = 2.5, duration: float = 0.72) -> dict[str, rec.GripperMotion]:
+def make_shaking_motion(
+    amplitude: float = 0.08, rate: float = 2.5, duration: float = 0.72
+) -> dict[str, rec.GripperMotion]:
     """Both grippers go up and down together; apart they stay at the sheet's width and 3 %, so that it is taut."""
     t = np.linspace(0.0, duration, 37)
     height = 1.0 + 0.5 * amplitude * (1 - np.cos(2 * np.pi * rate * t))
     out = {}
-    for name, u in EDGES.items():
-        position = np.stack([0 * t, 1.03 * (u - SIDE / 2) + 0 * t, height], axis=1)
+    for name, u in GRASPED_EDGES_U_M.items():
+        position = np.stack([0 * t, 1.03 * (u - SIDE_M / 2) + 0 * t, height], axis=1)
         quat = np.tile([1.0, 0.0, 0.0, 0.0], (len(t), 1))
         out[name] = rec.GripperMotion(t, position, quat, np.ones(len(t), bool))
     return out
 
 
-def hammock(model: tc.Cloth) -> torch.Tensor:
+def flat_positions(model: tc.Cloth) -> torch.Tensor:
     """[V, 3] m, the flat sheet between the grippers, before it sags."""
     u, v = torch.as_tensor(model.mesh.uv).T
-    return torch.stack([v - SIDE / 2, 1.03 * (u - SIDE / 2), torch.ones_like(u)], dim=-1)
+    return torch.stack([v - SIDE_M / 2, 1.03 * (u - SIDE_M / 2), torch.ones_like(u)], dim=-1)
 
 
-def bilinear(x: np.ndarray, shape: tuple[int, int], uv: np.ndarray) -> np.ndarray:
+def interpolate_bilinear(x: np.ndarray, shape: tuple[int, int], uv: np.ndarray) -> np.ndarray:
     """Positions [N, 3] m of material points on a grid of vertices."""
     columns, rows = shape
-    place = np.clip(uv / SIDE, 0, 1) * [columns - 1, rows - 1]
+    place = np.clip(uv / SIDE_M, 0, 1) * [columns - 1, rows - 1]
     cell = np.minimum(place.astype(int), [columns - 2, rows - 2])
     a, b = (place - cell).T[:, :, None]
     first = cell[:, 0] * rows + cell[:, 1]
@@ -91,60 +93,60 @@ def bilinear(x: np.ndarray, shape: tuple[int, int], uv: np.ndarray) -> np.ndarra
     return (1 - a) * low + a * high
 
 
-def twin(
-    fabric: Fabric = TRUE, seed: int = 0, amplitude: float = 0.08, rate: float = 2.5, noise: float = NOISE
+def make_twin(
+    fabric: Fabric = TRUE_FABRIC, seed: int = 0, amplitude: float = 0.08, rate: float = 2.5, noise: float = NOISE_M
 ) -> rec.Recording:
     """One episode: clouds of the true sheet with noise, and the sheet's first shape on the coarser mesh of the fit."""
     rng = np.random.default_rng(seed)
-    truth, mesh = cloth(fabric, TRUTH), tc.meshes.rectangle(SIDE, SIDE, resolution=FIT)
-    motion = shake(amplitude, rate)
-    t = np.arange(FRAMES) / RATE
+    truth, mesh = make_cloth(fabric, TRUTH_RESOLUTION), tc.meshes.rectangle(SIDE_M, SIDE_M, resolution=FIT_RESOLUTION)
+    motion = make_shaking_motion(amplitude, rate)
+    t = np.arange(FRAME_COUNT) / FRAME_RATE_HZ
     empty = rec.Recording(cloth=rec.ClothInfo(areal_density=1.0), provenance="synthetic: twins.py", grippers=motion)
     with torch.no_grad():
         trajectories = replay(empty)
-        state = truth.settle(truth.state(hammock(truth)), trajectories, duration=1.0, rate=15.0)
+        state = truth.settle(truth.state(flat_positions(truth)), trajectories, duration=1.0, rate=15.0)
         x = truth(state, trajectories, t.tolist(), dt=0.6 * truth.stable_step()).x.numpy()
-    clouds = [bilinear(frame, TRUTH, SIDE * rng.random((POINTS, 2))) for frame in x]
-    xyz = np.concatenate(clouds) + noise * rng.standard_normal((FRAMES * POINTS, 3))
+    clouds = [interpolate_bilinear(frame, TRUTH_RESOLUTION, SIDE_M * rng.random((POINTS_PER_FRAME, 2))) for frame in x]
+    xyz = np.concatenate(clouds) + noise * rng.standard_normal((FRAME_COUNT * POINTS_PER_FRAME, 3))
     return rec.Recording(
         cloth=rec.ClothInfo(
             areal_density=fabric.density,
             areal_density_std=0.005,
-            thickness=THICKNESS,
+            thickness=THICKNESS_M,
             vertices=mesh.vertices,
             faces=mesh.faces,
             uv=mesh.uv,
-            initial_vertices=bilinear(x[0], TRUTH, np.asarray(mesh.uv)),
+            initial_vertices=interpolate_bilinear(x[0], TRUTH_RESOLUTION, np.asarray(mesh.uv)),
             nominal={
-                "youngs_modulus": NOMINAL.membrane / THICKNESS,
-                "poisson_ratio": NOMINAL.poisson,
-                "bending_stiffness": NOMINAL.bending,
-                "bending_damping_time": NOMINAL.damping_time,
+                "youngs_modulus": NOMINAL_FABRIC.membrane / THICKNESS_M,
+                "poisson_ratio": NOMINAL_FABRIC.poisson,
+                "bending_stiffness": NOMINAL_FABRIC.bending,
+                "bending_damping_time": NOMINAL_FABRIC.damping_time,
             },
         ),
         provenance="synthetic: tests/identification/twins.py",
-        grasps={name: rec.GraspInfo(jaw(name), RADIUS) for name in EDGES},
+        grasps={name: rec.GraspInfo(jaw_points(name), GRASP_RADIUS_M) for name in GRASPED_EDGES_U_M},
         grippers=motion,
-        points=rec.PointClouds(t, xyz, np.full(FRAMES, POINTS)),
+        points=rec.PointClouds(t, xyz, np.full(FRAME_COUNT, POINTS_PER_FRAME)),
         observation_noise_std=noise,
         air_density=1.204,
     )
 
 
-def shifted(recording: rec.Recording, offset: float) -> rec.Recording:
+def shift_clock(recording: rec.Recording, offset: float) -> rec.Recording:
     """The same episode with the camera's clock ``offset`` seconds behind the motion's."""
     points = replace(recording.points, t=recording.points.t - offset)
     return replace(recording, points=points, clock_offset=offset)
 
 
-def first(recording: rec.Recording, frames: int) -> rec.Recording:
+def take_first_frames(recording: rec.Recording, frames: int) -> rec.Recording:
     """The first frames only: enough where a test asks about the machinery, at half the cost."""
     points = recording.points
     kept = int(points.counts[:frames].sum())
     return replace(recording, points=rec.PointClouds(points.t[:frames], points.xyz[:kept], points.counts[:frames]))
 
 
-def at(recording: rec.Recording, **nominal: float) -> tc.Cloth:
+def build_cloth_at(recording: rec.Recording, **nominal: float) -> tc.Cloth:
     """The cloth of an episode with some start values changed."""
     model = identification.build_cloth(recording)
     for name, value in nominal.items():
@@ -153,7 +155,7 @@ def at(recording: rec.Recording, **nominal: float) -> tc.Cloth:
 
 
 @contextmanager
-def doubles():
+def use_float64():
     """float64 for what is made once for all tests, before the fixture that sets it for each."""
     before = torch.get_default_dtype()
     torch.set_default_dtype(torch.float64)

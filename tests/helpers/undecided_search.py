@@ -12,9 +12,9 @@ from torchcloth.diagnosis.inference.fitting import reweight_by_noise
 from torchcloth.diagnosis.inference.noise import Noise
 
 
-def undecided(names, said="causes"):
+def make_undecided_search(names, said="causes"):
     """A search of a slow episode that ends with two causes of one class, named or too small to matter."""
-    recordings = [sheet_episodes.episode("slow", duration=0.4), sheet_episodes.episode("lift", duration=0.4)]
+    recordings = [sheet_episodes.make_episode("slow", duration=0.4), sheet_episodes.make_episode("lift", duration=0.4)]
     model = build_base_model(recordings[0])
     setting = prepare_data(model, recordings)
     asked = [h for h in list_hypotheses(model, recordings) if h.name in names]

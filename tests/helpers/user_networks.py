@@ -3,7 +3,7 @@
 import torch
 
 
-class Small(torch.nn.Module):
+class SmallNetwork(torch.nn.Module):
     """Two layers with dropout: what is random must be resumed too."""
 
     def __init__(self, width: int, drop: float = 0.0):
@@ -15,7 +15,7 @@ class Small(torch.nn.Module):
         return self.layers(places)
 
 
-class Spoilt(Small):
+class NanGradientNetwork(SmallNetwork):
     """Its gradient is no number from the second step on: of a root that has come to nothing, say."""
 
     def __init__(self):
@@ -27,7 +27,7 @@ class Spoilt(Small):
         return super().forward(places) + (0.0 if moved == 0 else 0.0 * (moved - moved.detach()).sqrt())
 
 
-class Counting(torch.nn.Sequential):
+class BatchNormNetwork(torch.nn.Sequential):
     """It remembers what it has seen."""
 
     def __init__(self):

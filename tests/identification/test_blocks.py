@@ -21,13 +21,13 @@ GRASP = {"grasp": 1e-3}
 
 @pytest.fixture(scope="module")
 def pulled():
-    with twins.doubles():
-        return stretched_sheets.record(markers=5)
+    with twins.use_float64():
+        return stretched_sheets.record_episode(markers=5)
 
 
 @pytest.fixture
 def model(pulled):
-    return stretched_sheets.model(pulled, youngs_modulus=7e4, poisson_ratio=0.3)
+    return stretched_sheets.build_start_cloth(pulled, youngs_modulus=7e4, poisson_ratio=0.3)
 
 
 def test_streams_share_one_list_of_times(pulled, model):
@@ -115,15 +115,15 @@ def test_a_lost_reading_takes_its_interval_and_no_other():
 
 def test_forces_are_those_of_the_rollout(pulled, model):
     """At the truth, on the truth's mesh: what is left is the sensor's noise, averaged over some three knots."""
-    exact = stretched_sheets.cloth(stretched_sheets.Fabric(), stretched_sheets.TRUTH)
+    exact = stretched_sheets.make_cloth(stretched_sheets.Fabric(), stretched_sheets.TRUTH_RESOLUTION)
     seen = build_episode(model, pulled)
-    start = torch.as_tensor(stretched_sheets.flat(exact.mesh))
+    start = torch.as_tensor(stretched_sheets.flat_positions(exact.mesh))
     with torch.no_grad():
         state = exact.settle(exact.state(start), seen.motion, duration=0.6)
         out = exact(state, seen.motion, seen.times)
     for name in ("left", "right"):
         error = (out.wrench[name] - seen.wrenches[name])[1:, :3]
-        noise = stretched_sheets.FORCE_NOISE / 3**0.5
+        noise = stretched_sheets.FORCE_NOISE_N / 3**0.5
         assert float(error.square().mean(0).sqrt().max()) < 2 * noise
         assert float(error.mean(0).abs().max()) < 4 * noise / len(error) ** 0.5
         assert float(seen.wrenches[name][1:, 0].abs().max()) > 0.4  # N: the noise is small beside it

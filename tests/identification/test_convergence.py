@@ -18,7 +18,7 @@ NUISANCES = {"grasp": 1e-3}
 
 def sheet(frames):
     """Pulled between clamps whose places are known to half a millimetre, in coarse cells."""
-    with twins.doubles():
+    with twins.use_float64():
         return cost.build_sheet_problem(cost.Scale(cell=0.05, frames=frames))
 
 
@@ -60,7 +60,7 @@ def test_a_search_cut_short_at_the_noise_keeps_its_answer(brief, one_step):
     assert not fit.fit["converged"]
     assert fit.fit["rms_after"] < CONVERGENCE_CRITERIA.max_residual_over_noise * brief.observation_noise_std
     assert result.identifiable
-    assert abs(result.value - twins.TRUE.membrane / twins.THICKNESS) < 3 * result.std
+    assert abs(result.value - twins.TRUE_FABRIC.membrane / twins.THICKNESS_M) < 3 * result.std
 
 
 def test_without_a_stated_noise_the_way_that_is_left_decides(model, brief):

@@ -22,13 +22,13 @@ from torchcloth.identification.prediction_report import print_episode_prediction
 @pytest.fixture(scope="module")
 def other():
     """The same fabric, shaken faster and less far."""
-    with twins.doubles():
-        return twins.first(twins.twin(seed=3, amplitude=0.05, rate=3.5), 8)
+    with twins.use_float64():
+        return twins.take_first_frames(twins.make_twin(seed=3, amplitude=0.05, rate=3.5), 8)
 
 
 @pytest.fixture(scope="module")
 def result(pair, other, tmp_path_factory):
-    with twins.doubles():
+    with twins.use_float64():
         return predict_episode(pair.save(tmp_path_factory.mktemp("fit")), other)
 
 
@@ -132,7 +132,7 @@ def test_tangents_of_an_unstable_motion_are_replaced_by_steps():
     clouds = rec.PointClouds(t[::20], np.tile([[0.0, 0.0, 0.5]], (4, 1)), np.ones(4, int))
     said = {"air_density": 1.2, "provenance": "synthetic: test"}
     swing = rec.Recording(cloth=info, grasps=grasps, grippers=hands, points=clouds, **said)
-    with twins.doubles():
+    with twins.use_float64():
         cloth = build_cloth(swing)
         data, unknowns = build_episode(cloth, swing), collect_unknowns(cloth, ["youngs_modulus", "air.normal"], None)
         raw, covariance = torch.tensor([u.start for u in unknowns]), torch.diag(torch.tensor([0.02, 0.03]) ** 2)

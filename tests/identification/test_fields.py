@@ -24,30 +24,32 @@ def in_stripe(mesh):
 
 
 def with_field(model, values):
-    model.material = tc.materials.AEP(values, 0.3, thickness=stretched_sheets.THICKNESS)
+    model.material = tc.materials.AEP(values, 0.3, thickness=stretched_sheets.THICKNESS_M)
     return model
 
 
 def start(recording):
-    model = stretched_sheets.model(recording)
+    model = stretched_sheets.build_start_cloth(recording)
     return with_field(model, torch.full((len(model.mesh.faces),), 6e4))
 
 
 @pytest.fixture
 def striped(monkeypatch):
     """A function that records a sheet with a stiff stripe on the truth's own mesh."""
-    plain = stretched_sheets.cloth
+    plain = stretched_sheets.make_cloth
 
     def cloth(fabric, resolution):
         model = plain(fabric, resolution)
         stripe = 1 + (STIFF - 1) * in_stripe(model.mesh)
-        return with_field(model, fabric.membrane / stretched_sheets.THICKNESS * stripe)
+        return with_field(model, fabric.membrane / stretched_sheets.THICKNESS_M * stripe)
 
     def record(**options):
-        setting = stretched_sheets.Setting(strain=0.1, heave=0.0, occluded=0.0, **options)
+        setting = stretched_sheets.EpisodeSettings(strain=0.1, heave=0.0, occluded=0.0, **options)
         with monkeypatch.context() as patched:
-            patched.setattr(stretched_sheets, "cloth", cloth)
-            return stretched_sheets.record(stretched_sheets.Fabric(membrane=40.0), seed=5, setting=setting, markers=11)
+            patched.setattr(stretched_sheets, "make_cloth", cloth)
+            return stretched_sheets.record_episode(
+                stretched_sheets.Fabric(membrane=40.0), seed=5, setting=setting, markers=11
+            )
 
     return record
 

@@ -26,15 +26,16 @@ STIFFNESS = ["youngs_modulus"]
 
 @pytest.fixture(scope="module")
 def felt():
-    with twins.doubles():
+    with twins.use_float64():
         return replace(
-            stretched_sheets.record(seed=5, setting=stretched_sheets.Setting(frames=9, strain=0.08)), points=None
+            stretched_sheets.record_episode(seed=5, setting=stretched_sheets.EpisodeSettings(frames=9, strain=0.08)),
+            points=None,
         )
 
 
 @pytest.fixture(scope="module")
 def fit(felt):
-    with twins.doubles():
+    with twins.use_float64():
         return identify(build_cloth(felt), felt, STIFFNESS, guess={"youngs_modulus": 1e5})
 
 

@@ -90,9 +90,9 @@ def test_every_parameter_has_an_experiment():
 @pytest.mark.slow
 def test_without_force_only_the_ratio_and_with_force_both():
     """Equivalence 2 of mechanics: motion alone does not know a scale. A twin's density, free of its measurement."""
-    with twins.doubles():
-        pulled = stretched_sheets.record()
-        model = stretched_sheets.model(pulled, youngs_modulus=6.5e4, poisson_ratio=0.3)
+    with twins.use_float64():
+        pulled = stretched_sheets.record_episode()
+        model = stretched_sheets.build_start_cloth(pulled, youngs_modulus=6.5e4, poisson_ratio=0.3)
         for name in ("air.normal", "bending.stiffness"):  # they would tell a scale
             model.get_submodule(f"effects.{name}").set(0.0)
     names, options = ["youngs_modulus", "areal_density"], {"iterations": 2, "nuisances": {"grasp": 1e-3}}

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 from helpers.schema_checks import check_written
-from helpers.twins import THICKNESS, TRUE, at, first, twin
+from helpers.twins import THICKNESS_M, TRUE_FABRIC, build_cloth_at, make_twin, take_first_frames
 
 import torchcloth as tc
 from torchcloth.errors import InvalidInput
@@ -27,19 +27,19 @@ def within(estimate, truth, sigmas=3.0):
 def test_stiffness_and_air_are_found_from_a_start_twice_off(fitted):
     """Three standard errors, and ten per cent: the first alone would be met by a fit that says nothing."""
     p = fitted[0].parameters
-    assert within(p["membrane_stiffness"], TRUE.membrane)
-    assert p["membrane_stiffness"].value == pytest.approx(TRUE.membrane, rel=0.10)
-    assert within(p["air.normal"], TRUE.drag)
-    assert p["air.normal"].value == pytest.approx(TRUE.drag, rel=0.15)
-    assert within(p["poisson_ratio"], TRUE.poisson)
-    assert within(p["bending.stiffness"], TRUE.bending)
+    assert within(p["membrane_stiffness"], TRUE_FABRIC.membrane)
+    assert p["membrane_stiffness"].value == pytest.approx(TRUE_FABRIC.membrane, rel=0.10)
+    assert within(p["air.normal"], TRUE_FABRIC.drag)
+    assert p["air.normal"].value == pytest.approx(TRUE_FABRIC.drag, rel=0.15)
+    assert within(p["poisson_ratio"], TRUE_FABRIC.poisson)
+    assert within(p["bending.stiffness"], TRUE_FABRIC.bending)
     assert all(p[name].identifiable for name in ("youngs_modulus", "membrane_stiffness", "air.normal"))
 
 
 def test_the_density_keeps_to_its_measurement(fitted):
     density = fitted[0].parameters["areal_density"]
     assert density.source == "prior"
-    assert abs(density.value - TRUE.density) < 3 * STATED
+    assert abs(density.value - TRUE_FABRIC.density) < 3 * STATED
     assert (
         density.std <= 1.3 * STATED
     )  # a second source of knowledge cannot leave one with less; robust errors may vary
@@ -128,12 +128,12 @@ def test_the_start_does_not_matter(plain, pair):
     for name in PAIR:
         a, b = plain.parameters[name], pair.parameters[name]
         assert abs(a.value - b.value) < min(a.std, b.std), name
-    assert pair.parameters["membrane_stiffness"].value == pytest.approx(TRUE.membrane, rel=0.10)
+    assert pair.parameters["membrane_stiffness"].value == pytest.approx(TRUE_FABRIC.membrane, rel=0.10)
 
 
 def test_apply_sets_what_is_identifiable_and_nothing_else(fitted, recording):
     fit, _ = fitted
-    cloth = at(recording)
+    cloth = build_cloth_at(recording)
     before = {name: value.detach().clone() for name, value in cloth.named_parameters()}
     assert fit.apply(cloth) is cloth
     assert cloth.material.youngs_modulus.value.item() == pytest.approx(fit.parameters["youngs_modulus"].value)
@@ -152,13 +152,13 @@ def test_apply_sets_what_is_identifiable_and_nothing_else(fitted, recording):
 
 def test_a_cloth_that_hangs_still_says_nothing_about_air():
     """No motion, no drag: the prior comes back, called unidentifiable, with an interval that says so."""
-    still = first(twin(amplitude=0.0), 6)
-    fit = identify(at(still, youngs_modulus=4e4), still, ["air.normal"], iterations=3)
+    still = take_first_frames(make_twin(amplitude=0.0), 6)
+    fit = identify(build_cloth_at(still, youngs_modulus=4e4), still, ["air.normal"], iterations=3)
     air = fit.parameters["air.normal"]
     assert not air.identifiable
     assert air.std > 0.5 * 2 * tc.effects.AirDrag.amplitudes["normal"].typical  # no less than half its prior
     assert "air.normal is not identifiable from these data: its value is no estimate" in fit.warnings
-    cloth = at(still)
+    cloth = build_cloth_at(still)
     fit.apply(cloth)
     assert cloth.effects["air"].normal.value.item() == tc.effects.AirDrag.amplitudes["normal"].typical
 
@@ -166,22 +166,26 @@ def test_a_cloth_that_hangs_still_says_nothing_about_air():
 @pytest.mark.slow
 def test_two_episodes_say_more_than_one(recording, pair):
     """A replicate with noise of its own: errors shrink by about sqrt 2, and are themselves known to some 20 %."""
-    both = identify(at(recording, youngs_modulus=3e4), [recording, twin(seed=1)], PAIR)
+    both = identify(build_cloth_at(recording, youngs_modulus=3e4), [recording, make_twin(seed=1)], PAIR)
     for name in PAIR:
         assert both.parameters[name].std < pair.parameters[name].std, name
-    assert both.parameters["membrane_stiffness"].value == pytest.approx(TRUE.membrane, rel=0.10)
-    assert within(both.parameters["air.normal"], TRUE.drag)
+    assert both.parameters["membrane_stiffness"].value == pytest.approx(TRUE_FABRIC.membrane, rel=0.10)
+    assert within(both.parameters["air.normal"], TRUE_FABRIC.drag)
     assert len(both.frames_after) == 2
     assert both.fit["points"] == 2 * pair.fit["points"]
 
 
 def test_two_episodes_at_once(brief):
     """Short ones: what is said of each is counted for both."""
-    fit = identify(at(brief, youngs_modulus=5e4), [brief, first(twin(seed=1, rate=2.0), 5)], ["youngs_modulus"])
+    fit = identify(
+        build_cloth_at(brief, youngs_modulus=5e4),
+        [brief, take_first_frames(make_twin(seed=1, rate=2.0), 5)],
+        ["youngs_modulus"],
+    )
     assert len(fit.frames_before) == len(fit.frames_after) == len(fit.frames_null) == 2
     assert [len(x) for x in fit.frames_after] == [6, 5]
     assert fit.fit["points"] == 11 * 120
-    assert fit.parameters["membrane_stiffness"].value == pytest.approx(TRUE.membrane, rel=0.15)
+    assert fit.parameters["membrane_stiffness"].value == pytest.approx(TRUE_FABRIC.membrane, rel=0.15)
 
 
 def test_adam_lowers_the_chamfer_in_three_iterations(model, brief):
@@ -218,8 +222,10 @@ def test_no_search_that_never_moved_presents_its_start_as_the_answer(model, brie
     result = fit.parameters["youngs_modulus"]
     assert result.value == pytest.approx(result.initial)  # twice the truth
     assert not result.identifiable
-    assert result.ci95[0] < TRUE.membrane / THICKNESS < result.ci95[1]
-    assert fit.apply(at(brief)).material.youngs_modulus.value.item() == pytest.approx(8e4)  # as the data sheet has it
+    assert result.ci95[0] < TRUE_FABRIC.membrane / THICKNESS_M < result.ci95[1]
+    assert fit.apply(build_cloth_at(brief)).material.youngs_modulus.value.item() == pytest.approx(
+        8e4
+    )  # as the data sheet has it
 
 
 def test_iterations_are_at_most_what_was_asked(one_step):
@@ -248,7 +254,7 @@ def test_known_density_is_not_fitted_and_the_reader_is_told(brief):
     from dataclasses import replace
 
     exact = replace(brief, cloth=replace(brief.cloth, areal_density_std=None))
-    fit = identify(at(exact, youngs_modulus=4e4), exact, PAIR, iterations=1)
+    fit = identify(build_cloth_at(exact, youngs_modulus=4e4), exact, PAIR, iterations=1)
     assert "areal_density" not in fit.parameters
     assert any(w.startswith("areal density was taken as exact") for w in fit.warnings)
 
@@ -270,7 +276,7 @@ def test_an_effect_that_the_episode_does_not_bring_says_how(recording, name, rem
 
 def test_the_density_was_weighed_wherever_the_fit_starts(recording):
     made = recording
-    cloth = at(made)
+    cloth = build_cloth_at(made)
     cloth.areal_density.set(1.3 * made.cloth.areal_density)
     result = identify(cloth, made, ["youngs_modulus", "air.normal"]).parameters["areal_density"]
     assert result.value == pytest.approx(made.cloth.areal_density, abs=3 * made.cloth.areal_density_std)
@@ -295,7 +301,7 @@ def test_a_path_is_no_recording(model, tmp_path):
 
 def test_a_cloth_on_another_device_is_refused(recording):
     """Tensors without numbers stand for a GPU's."""
-    cloth = at(recording).to("meta")
+    cloth = build_cloth_at(recording).to("meta")
     for ask in (
         lambda: identify(cloth, recording, ["youngs_modulus"]),
         lambda: fit_fields(cloth, recording, ["youngs_modulus"]),

@@ -6,7 +6,7 @@ import pytest
 import scipy.optimize
 import torch
 from helpers import least_squares
-from helpers.least_squares import START, TRUE, curved, linear, solve
+from helpers.least_squares import START_UNKNOWNS, TRUE_UNKNOWNS, make_curved_problem, make_linear_problem, solve
 
 from torchcloth.errors import SimulationDiverged, UnstableStep
 from torchcloth.identification.estimators import levenberg_marquardt
@@ -20,8 +20,8 @@ FITS = 200
 
 def optimum(toy):
     """The robust cost's own minimum near the solver's answer, by plain Newton to convergence from the truth."""
-    raw = TRUE.clone()
-    final = solve(toy, start=TRUE.clone(), tolerance=1e-6)
+    raw = TRUE_UNKNOWNS.clone()
+    final = solve(toy, start=TRUE_UNKNOWNS.clone(), tolerance=1e-6)
     scale, share = final.scale, final.effective_fraction
     for _ in range(50):
         linear = toy._linearise(raw)
@@ -37,14 +37,14 @@ def deviations(toy, at):
 
 
 def test_a_linear_problem_is_solved():
-    toy, _ = linear(0)
+    toy, _ = make_linear_problem(0)
     final = solve(toy, tolerance=1e-3)
     assert final.exact
     assert final.converged
     missed = (final.raw - optimum(toy)).abs() / deviations(toy, final)
     assert float(missed.max()) < 1e-2  # standard errors: a tenth of nothing is lost to the stop rule
-    assert float(((final.raw - TRUE).abs() / deviations(toy, final)).max()) < 3.5
-    assert final.scale == pytest.approx(least_squares.SIGMA, rel=0.1)
+    assert float(((final.raw - TRUE_UNKNOWNS).abs() / deviations(toy, final)).max()) < 3.5
+    assert final.scale == pytest.approx(least_squares.SIGMA_M, rel=0.1)
     assert final.effective_fraction > 0.5  # independent residuals count as such
 
 
@@ -55,9 +55,9 @@ def coverage():
     for shared in (0.0, 1.0):
         stated, naive = [], []
         for seed in range(FITS):
-            toy, jacobian = linear(1000 + seed, shared)
+            toy, jacobian = make_linear_problem(1000 + seed, shared)
             final = solve(toy)
-            error = (final.raw - TRUE).abs()
+            error = (final.raw - TRUE_UNKNOWNS).abs()
             stated.append(error < 1.96 * deviations(toy, final))
             alone = torch.linalg.inv(jacobian.mT @ jacobian).diagonal().sqrt() * final.scale
             naive.append(error < 1.96 * alone)
@@ -85,7 +85,7 @@ def test_intervals_are_not_needlessly_wide():
     """Coverage alone would be met by infinite intervals: for independent noise they are near the best."""
     ratio = []
     for seed in range(20):
-        toy, jacobian = linear(5000 + seed)
+        toy, jacobian = make_linear_problem(5000 + seed)
         final = solve(toy)
         ratio.append(deviations(toy, final) / (torch.linalg.inv(jacobian.mT @ jacobian).diagonal().sqrt() * 1e-3))
     assert 0.9 < float(torch.stack(ratio).mean()) < 1.5
@@ -95,9 +95,11 @@ def many(seed, shared, unknowns, frames=20):
     """(error, stated deviation) of three parameters beside nuisances, of twenty frames."""
     generator = torch.Generator().manual_seed(seed)
     true = 0.3 * torch.randn(unknowns, generator=generator, dtype=torch.float64)
-    jacobian = least_squares.sensitivities(generator, frames, unknowns)
-    data = jacobian @ true + least_squares.noise(generator, shared, frames)
-    toy = least_squares.Toy(lambda raw: jacobian @ raw, data, *least_squares.layout(frames), unknowns=unknowns)
+    jacobian = least_squares.draw_jacobian(generator, frames, unknowns)
+    data = jacobian @ true + least_squares.draw_noise(generator, shared, frames)
+    toy = least_squares.ToyProblem(
+        lambda raw: jacobian @ raw, data, *least_squares.row_layout(frames), unknowns=unknowns
+    )
     final = solve(toy, start=torch.zeros(unknowns, dtype=torch.float64))
     return (final.raw - true)[:3], deviations(toy, final)[:3]
 
@@ -120,7 +122,9 @@ def test_few_readings_are_as_uncertain_as_few_are(rows, unknowns):
     for seed in range(FITS):
         generator = torch.Generator().manual_seed(seed)
         true, noise = (torch.randn(n, generator=generator, dtype=torch.float64) for n in (unknowns, rows))
-        toy = least_squares.Toy(lambda raw: jacobian @ raw, jacobian @ true + 0.01 * noise, *where, unknowns=unknowns)
+        toy = least_squares.ToyProblem(
+            lambda raw: jacobian @ raw, jacobian @ true + 0.01 * noise, *where, unknowns=unknowns
+        )
         final = solve(toy, start=torch.zeros(unknowns, dtype=torch.float64))
         hits.append((final.raw - true).abs() < 1.96 * deviations(toy, final))
     assert 0.9 < share(torch.stack(hits)) < 0.99
@@ -140,7 +144,7 @@ def test_few_readings_of_one_kind_are_few_beside_many_of_another(rows):
     for seed in range(400):
         generator = torch.Generator().manual_seed(seed)
         true, noise = (torch.randn(n, generator=generator, dtype=torch.float64) for n in (2, many + rows))
-        toy = least_squares.Toy(
+        toy = least_squares.ToyProblem(
             lambda raw: jacobian @ raw, jacobian @ true + 0.01 * noise, where, 0 * where, unknowns=2
         )
         kinds = toy.problem()._replace(linearise=lambda raw, toy=toy: toy._linearise(raw)._replace(block=block))
@@ -160,7 +164,7 @@ def test_errors_do_not_hang_on_the_rate_of_frames():
         frame = torch.arange(len(t))
         for seed in range(60):
             noise = root @ torch.randn(len(t), generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
-            toy = least_squares.Toy(lambda raw, j=jacobian: j @ raw, 0.01 * noise, frame, 0 * frame, unknowns=2)
+            toy = least_squares.ToyProblem(lambda raw, j=jacobian: j @ raw, 0.01 * noise, frame, 0 * frame, unknowns=2)
             moment = frame // (rate // 30)
             slow = toy.problem()._replace(
                 linearise=lambda raw, t=toy, m=moment: t._linearise(raw)._replace(time_block=m)
@@ -176,15 +180,15 @@ def test_errors_do_not_hang_on_the_rate_of_frames():
 
 
 def test_shared_noise_counts_as_few_observations():
-    alone, shared = (solve(linear(0, s)[0]).effective_fraction for s in (0.0, 1.0))
+    alone, shared = (solve(make_linear_problem(0, s)[0]).effective_fraction for s in (0.0, 1.0))
     assert shared < 0.4 * alone
 
 
 def test_broyden_and_exact_jacobians_end_at_the_same_point():
     """To a fraction of a standard error; Broyden saves linearisations, which are what a simulation pays for."""
-    saving = curved()
+    saving = make_curved_problem()
     a = solve(saving, tolerance=0.01)
-    exact = curved()
+    exact = make_curved_problem()
     b = solve(exact, tolerance=0.01, settings=levenberg_marquardt.SolverSettings(broyden_tolerance=-1.0))
     assert float(((a.raw - b.raw).abs() / deviations(exact, b)).max()) < 0.05
     assert len(saving.linearised) < len(exact.linearised)
@@ -235,11 +239,11 @@ def test_an_amplitude_at_zero_stays_there_while_others_move():
 
 def test_unknowns_do_not_wait_for_one_that_may_go_no_farther():
     """The third hardly shows and wants to go 70 steps; the others are where the data have them after a few."""
-    toy, jacobian = linear(0)
+    toy, jacobian = make_linear_problem(0)
     faint = jacobian.clone()
     faint[:, 2] = 0.01 * (jacobian[:, 0] + 0.3 * jacobian[:, 2])
     toy.prior_std, toy.model = 1e4, lambda raw: faint @ raw
-    toy.data = jacobian @ TRUE + least_squares.noise(torch.Generator().manual_seed(0), 0.0)
+    toy.data = jacobian @ TRUE_UNKNOWNS + least_squares.draw_noise(torch.Generator().manual_seed(0), 0.0)
     final = solve(toy, iterations=3)
     assert float(final.raw[2]) < 4
     rest = torch.linalg.lstsq(faint[:, :2], (toy.data - faint[:, 2] * final.raw[2])[:, None]).solution.squeeze()
@@ -248,16 +252,16 @@ def test_unknowns_do_not_wait_for_one_that_may_go_no_farther():
 
 
 def test_nothing_is_left_to_go_at_the_optimum():
-    toy, _ = linear(0)
+    toy, _ = make_linear_problem(0)
     assert remaining_std_errors(toy.problem(), solve(toy, tolerance=1e-6)) < 1e-3
-    start = levenberg_marquardt._linearise(toy.problem(), START)
+    start = levenberg_marquardt._linearise(toy.problem(), START_UNKNOWNS)
     gradient, hessian = levenberg_marquardt.normal_equations(toy.problem(), start)
     far = float((gradient @ torch.linalg.solve(hessian, gradient)).sqrt())
     assert remaining_std_errors(toy.problem(), start) == pytest.approx(far)
 
 
 def test_the_final_point_is_linearised_exactly():
-    toy = curved()
+    toy = make_curved_problem()
     final = solve(toy, iterations=2)  # stopped in the middle
     assert not final.converged
     assert torch.equal(toy.linearised[-1], final.raw)
@@ -267,28 +271,28 @@ def test_the_final_point_is_linearised_exactly():
 @pytest.mark.parametrize("error", [SimulationDiverged, UnstableStep])
 def test_steps_that_cannot_be_simulated_are_survived(error):
     """Beyond 0.2 from the last accepted point the simulation is lost; the solver shortens its steps and arrives."""
-    toy, _ = linear(0)
+    toy, _ = make_linear_problem(0)
     accepted = []
 
     def forbidden(raw):
         return error("lost") if float((raw - accepted[-1]).abs().max()) > 0.2 else None
 
     toy.forbidden = forbidden
-    final = minimise(toy.problem(), START, 60, lambda it: accepted.append(it.raw))
+    final = minimise(toy.problem(), START_UNKNOWNS, 60, lambda it: accepted.append(it.raw))
     assert len(toy.evaluated) > len(accepted)  # some were refused
     assert float(((final.raw - optimum(toy)).abs() / deviations(toy, final)).max()) < 0.5
 
 
 def test_when_nothing_can_be_simulated_the_start_is_returned():
-    toy, _ = linear(0)
+    toy, _ = make_linear_problem(0)
     toy.forbidden = lambda raw: SimulationDiverged("lost")
     final = solve(toy)
-    assert torch.equal(final.raw, START)
+    assert torch.equal(final.raw, START_UNKNOWNS)
     assert final.exact
 
 
 def test_other_errors_are_not_swallowed():
-    toy, _ = linear(0)
+    toy, _ = make_linear_problem(0)
     toy.forbidden = lambda raw: ZeroDivisionError("a bug")
     with pytest.raises(ZeroDivisionError):
         solve(toy)
@@ -296,30 +300,30 @@ def test_other_errors_are_not_swallowed():
 
 @pytest.mark.parametrize("after", [0, 2])
 def test_on_iterate_stops(after):
-    toy, points = curved(), []
+    toy, points = make_curved_problem(), []
 
     def stop(it):
         points.append(it.raw)
         return len(points) == after + 1
 
-    final = minimise(toy.problem(), START, 35, stop)
+    final = minimise(toy.problem(), START_UNKNOWNS, 35, stop)
     assert len(points) == after + 1
     assert torch.equal(final.raw, points[-1])
     assert final.exact
 
 
 def test_no_iterations_only_linearise():
-    toy, points = curved(), []
-    final = minimise(toy.problem(), START, 0, lambda it: points.append(it.raw))
-    assert torch.equal(final.raw, START)
+    toy, points = make_curved_problem(), []
+    final = minimise(toy.problem(), START_UNKNOWNS, 0, lambda it: points.append(it.raw))
+    assert torch.equal(final.raw, START_UNKNOWNS)
     assert len(points) == 1
     assert not toy.evaluated
 
 
 def test_the_cost_never_grows():
-    toy, costs = curved(), []
+    toy, costs = make_curved_problem(), []
     problem = toy.problem()
-    minimise(problem, START, 35, lambda it: costs.append(float(it.linear.residual.square().sum())))
+    minimise(problem, START_UNKNOWNS, 35, lambda it: costs.append(float(it.linear.residual.square().sum())))
     for before, now in pairwise(costs):  # squares, where the solver's cost is robust and has a prior
         assert now < before * (1 + 1e-3)
     assert costs[-1] < 0.5 * costs[0]
@@ -327,11 +331,11 @@ def test_the_cost_never_grows():
 
 def test_outliers_do_not_move_the_answer():
     """5 % of the points 50 sigma off: least squares would move by many standard errors."""
-    toy, jacobian = linear(0)
-    spoilt, _ = linear(0)
+    toy, jacobian = make_linear_problem(0)
+    spoilt, _ = make_linear_problem(0)
     pick = torch.randperm(len(spoilt.data), generator=torch.Generator().manual_seed(1))[: len(spoilt.data) // 20]
     spoilt.data = spoilt.data.clone()
-    spoilt.data[pick] += 50 * least_squares.SIGMA
+    spoilt.data[pick] += 50 * least_squares.SIGMA_M
     clean, dirty = solve(toy), solve(spoilt)
     least = torch.linalg.lstsq(jacobian, spoilt.data[:, None]).solution.squeeze()
     moved, deviation = (dirty.raw - clean.raw).abs(), deviations(toy, clean)
@@ -340,20 +344,20 @@ def test_outliers_do_not_move_the_answer():
 
 
 def test_a_prior_decides_where_the_data_are_silent():
-    toy, jacobian = linear(0)
+    toy, jacobian = make_linear_problem(0)
     blind = jacobian.clone()
     blind[:, 2] = 0.0
     toy.model = lambda raw: blind @ raw
-    toy.data = blind @ TRUE + least_squares.noise(torch.Generator().manual_seed(0), 0.0)
+    toy.data = blind @ TRUE_UNKNOWNS + least_squares.draw_noise(torch.Generator().manual_seed(0), 0.0)
     final = solve(toy)
     assert float(final.raw[2]) == 0.0
     assert float(deviations(toy, final)[2]) == pytest.approx(toy.prior_std, rel=1e-6)
-    assert float(((final.raw - TRUE)[:2].abs() / deviations(toy, final)[:2]).max()) < 3.5
+    assert float(((final.raw - TRUE_UNKNOWNS)[:2].abs() / deviations(toy, final)[:2]).max()) < 3.5
 
 
 def test_covariance_is_symmetric_and_positive():
     for shared in (0.0, 1.0):
-        toy, _ = linear(0, shared)
+        toy, _ = make_linear_problem(0, shared)
         matrix = covariance(toy.problem(), solve(toy))
         torch.testing.assert_close(matrix, matrix.mT)
         assert float(torch.linalg.eigvalsh(matrix).min()) > 0
@@ -393,7 +397,7 @@ def test_a_step_that_is_short_for_its_damping_is_no_convergence():
 
 def test_what_was_not_seen_is_no_observation():
     """Pieces of the rim that no camera saw are rows of zeros: fifty made the errors of four rows half as large."""
-    toy, jacobian = linear(0)
+    toy, jacobian = make_linear_problem(0)
     for few in (slice(0, 8), slice(None)):
         of_part = Linearised(
             toy.data[few], jacobian[few], torch.ones(len(toy.data[few])), toy.frame[few], toy.patch[few]
@@ -405,7 +409,7 @@ def test_what_was_not_seen_is_no_observation():
         )
         both = Linearised(*(torch.cat(rows) for rows in zip(of_part[:5], unseen[:5], strict=True)))
         alone, among = (
-            covariance(toy.problem(), levenberg_marquardt.evaluate_point(toy.problem(), TRUE, rows))
+            covariance(toy.problem(), levenberg_marquardt.evaluate_point(toy.problem(), TRUE_UNKNOWNS, rows))
             for rows in (of_part, both)
         )
         torch.testing.assert_close(alone, among, rtol=1e-12, atol=0.0)

@@ -17,10 +17,10 @@ ONE = torch.ones(3, dtype=torch.float64)
 def problem():
     """(a linear problem without simulation, its solution); ``secants`` are what the test makes them."""
     draw = torch.Generator().manual_seed(0)
-    slopes, (frame, patch) = least_squares.sensitivities(draw), least_squares.layout()
-    value = least_squares.SIGMA * torch.randn(len(frame), generator=draw, dtype=torch.float64)
+    slopes, (frame, patch) = least_squares.draw_jacobian(draw), least_squares.row_layout()
+    value = least_squares.SIGMA_M * torch.randn(len(frame), generator=draw, dtype=torch.float64)
     linear = levenberg_marquardt.Linearised(value, slopes, torch.ones_like(value), frame, patch)
-    solver = levenberg_marquardt.Problem(None, None, None, 0 * ONE, 5 * ONE, ONE, torch.tensor([least_squares.SIGMA]))
+    solver = levenberg_marquardt.Problem(None, None, None, 0 * ONE, 5 * ONE, ONE, torch.tensor([least_squares.SIGMA_M]))
     objective = SimpleNamespace(
         problem=lambda: solver,
         unknowns=[SimpleNamespace(name=name) for name in "abc"],

@@ -19,18 +19,18 @@ EVERY = ("clock", "camera", "tare", "grasp", "shape")
 
 @pytest.fixture(scope="module")
 def pulled():
-    with twins.doubles():
-        return stretched_sheets.record(markers=5)
+    with twins.use_float64():
+        return stretched_sheets.record_episode(markers=5)
 
 
 def near(recording):
     """A start that is wrong by a sixth: the search is short."""
-    return stretched_sheets.model(recording, youngs_modulus=7e4, poisson_ratio=0.3)
+    return stretched_sheets.build_start_cloth(recording, youngs_modulus=7e4, poisson_ratio=0.3)
 
 
 @pytest.fixture
 def objective(pulled):
-    model = stretched_sheets.model(pulled)
+    model = stretched_sheets.build_start_cloth(pulled)
     seen = build_episode(model, pulled).first_fraction(0.3)
     return Objective(
         model, collect_unknowns(model, ["youngs_modulus"], None), [seen, seen], 4e-4, select_nuisances(EVERY, ["rim"])
@@ -57,7 +57,7 @@ def test_every_unknown_has_its_slope(objective):
 
 def test_a_first_shape_that_was_not_measured_does_not_settle(pulled):
     """Slopes along where the grippers hold, of cloth that moves from the first frame on."""
-    model = stretched_sheets.model(pulled)
+    model = stretched_sheets.build_start_cloth(pulled)
     seen = replace(build_episode(model, pulled).first_fraction(0.3), needs_settling=False)
     result = Objective(
         model, collect_unknowns(model, ["youngs_modulus"], None), [seen], 4e-4, select_nuisances(["grasp"])
@@ -67,7 +67,7 @@ def test_a_first_shape_that_was_not_measured_does_not_settle(pulled):
 
 
 def test_what_a_late_clock_sees_moves_as_fast_as_it_is_seen_to(pulled):
-    model = stretched_sheets.model(pulled)
+    model = stretched_sheets.build_start_cloth(pulled)
     seen, of_part = build_episode(model, pulled).first_fraction(0.3), collect_unknowns(model, ["youngs_modulus"], None)
     frames, clock, h = simulate(model, of_part, torch.tensor([of_part[0].start]), seen), NUISANCE_KINDS["clock"](), 1e-6
     one, two = (clock.observe(frames, torch.tensor([0.004 + d]), seen) for d in (-h, h))
@@ -82,7 +82,7 @@ def test_an_episodes_nuisances_do_not_touch_the_other(objective):
 
 
 def test_a_late_clock_is_found(pulled):
-    late = stretched_sheets.record(setting=stretched_sheets.Setting(clock=0.02))
+    late = stretched_sheets.record_episode(setting=stretched_sheets.EpisodeSettings(clock=0.02))
     fit = identify(near(late), late, ["youngs_modulus"], nuisances={"clock": 0.05}, iterations=4)
     (of_part,) = fit.nuisances.values()
     assert abs(of_part["clock"].value - 0.02) < 4 * of_part["clock"].std
@@ -92,7 +92,7 @@ def test_a_late_clock_is_found(pulled):
 
 
 def test_a_late_clock_far_from_zero_and_in_single_precision(pulled):
-    seen = build_episode(stretched_sheets.model(pulled), pulled)
+    seen = build_episode(stretched_sheets.build_start_cloth(pulled), pulled)
     wave = lambda t: (torch.sin(9.0 * t), 9.0 * torch.cos(9.0 * t))  # noqa: E731
     since = seen.times - seen.times[0]
     x, v = (f.float()[:, None, None] for f in wave(since))
@@ -104,7 +104,7 @@ def test_a_late_clock_far_from_zero_and_in_single_precision(pulled):
 
 def test_a_late_clock_sees_what_comes_after_the_last_frame(pulled):
     """Against a simulation at the later times; without more frames the cloth would stand still at the last."""
-    model = stretched_sheets.model(pulled)
+    model = stretched_sheets.build_start_cloth(pulled)
     seen = build_episode(model, pulled)
     longer, late = seen.with_lookahead(0.09), 0.05
     assert longer.observed_count == len(seen.times)

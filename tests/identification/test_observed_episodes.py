@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 from helpers import twins
-from helpers.twins import at, shifted
+from helpers.twins import build_cloth_at, shift_clock
 
 import torchcloth as tc
 from torchcloth import recordings as rec
@@ -67,7 +67,7 @@ def test_patches_end_where_they_are_said_to_and_the_first_shape_is_carried_there
             mine = uv[model.boundaries["left"].index.numpy()]
             assert mine[mine[:, 1] == 0, 0].max() == pytest.approx(radius, rel=1e-9)
             assert mine[mine[:, 0] == 0, 1].max() == pytest.approx(radius, rel=1e-9)
-            assert model.mesh.area.sum() == pytest.approx(twins.SIDE**2)
+            assert model.mesh.area.sum() == pytest.approx(twins.SIDE_M**2)
             reached = compute_initial_vertices("", model, episode_).numpy()
             np.testing.assert_allclose(reached[:, :2], uv, atol=1e-9)
             if model is cloth:  # of the finer mesh, vertices lie on the coarse one's chords
@@ -123,7 +123,7 @@ def test_a_single_frame_is_refused(recording, model):
 @pytest.mark.parametrize("offset", [12.5, -0.3])
 def test_the_clock_offset_is_added_to_the_observations(recording, model, offset):
     """t_motion = t_observation + clock_offset, as the format says; the wrong sign would be off by twice it."""
-    moved = shifted(recording, offset)
+    moved = shift_clock(recording, offset)
     np.testing.assert_allclose(moved.points.t, recording.points.t - offset)
     seen = build_episode(model, moved)
     np.testing.assert_allclose(seen.times.numpy(), recording.points.t, atol=1e-9)
@@ -139,10 +139,10 @@ def test_a_clock_that_is_off_is_refused_with_the_remedy(recording, model):
 def test_frames_after_the_motion_are_left_out(recording, model):
     late = replace(recording, clock_offset=0.12)  # two and a half frames beyond 0.72 s
     seen = build_episode(model, late)
-    assert len(seen.times) == len(seen.clouds) == twins.FRAMES - 2
+    assert len(seen.times) == len(seen.clouds) == twins.FRAME_COUNT - 2
     assert float(seen.times[-1]) <= 0.72
     (doubt,) = seen.data_warnings()
-    assert f"2 of {twins.FRAMES} frames come after the motion's end" in doubt
+    assert f"2 of {twins.FRAME_COUNT} frames come after the motion's end" in doubt
     assert build_episode(model, recording).data_warnings() == []
 
 
@@ -175,7 +175,7 @@ def test_a_gripper_without_a_grasp_says_so(recording, model):
 
 def test_until_keeps_the_early_frames(recording, model):
     seen = build_episode(model, recording)
-    assert len(seen.first_fraction(0.5).clouds) == len(seen.first_fraction(0.5).times) == round(0.5 * twins.FRAMES)
+    assert len(seen.first_fraction(0.5).clouds) == len(seen.first_fraction(0.5).times) == round(0.5 * twins.FRAME_COUNT)
     assert len(seen.first_fraction(0.0).clouds) == 4  # fewer would not be a motion
 
 
@@ -301,13 +301,13 @@ def test_wrong_arguments_are_named(model, recording, arguments, said):
 
 
 def test_episodes_of_another_cloth_or_grasp_are_refused(model, recording):
-    other = with_cloth(shifted(recording, 1.0), areal_density=2 * recording.cloth.areal_density)
+    other = with_cloth(shift_clock(recording, 1.0), areal_density=2 * recording.cloth.areal_density)
     with pytest.raises(InvalidInput, match=r"another areal density \(kg/m\^2\) than in"):
         identify(model, [recording, other])
-    one = replace(shifted(recording, 1.0), grasps=dict(list(recording.grasps.items())[:1]))
+    one = replace(shift_clock(recording, 1.0), grasps=dict(list(recording.grasps.items())[:1]))
     with pytest.raises(InvalidInput, match="another set of grasps than in"):
         identify(model, [recording, one])
-    numbered = with_cloth(shifted(recording, 1.0), faces=recording.cloth.faces[::-1])
+    numbered = with_cloth(shift_clock(recording, 1.0), faces=recording.cloth.faces[::-1])
     with pytest.raises(InvalidInput, match="another numbering of the mesh"):
         identify(model, [recording, numbered])
 
@@ -338,7 +338,7 @@ def test_no_parameters_are_refused(model, recording):
 
 
 def test_a_field_is_not_a_scalar(recording):
-    cloth = at(recording)
+    cloth = build_cloth_at(recording)
     from torchcloth import PhysicalParameter
 
     field = torch.full((len(cloth.mesh.faces),), 0.3)
@@ -349,14 +349,14 @@ def test_a_field_is_not_a_scalar(recording):
 
 def test_force_readings_after_the_last_cloud_are_told():
     """Frames are those of what is seen: readings of a second were dropped without a word."""
-    whole = twins.twin()
+    whole = twins.make_twin()
     t = whole.grippers["left"].t
     hands = {name: replace(m, force=np.zeros((len(t), 3))) for name, m in whole.grippers.items()}
-    short = replace(twins.first(whole, 4), grippers=hands)
-    data = build_episode(twins.at(short), short)
+    short = replace(twins.take_first_frames(whole, 4), grippers=hands)
+    data = build_episode(twins.build_cloth_at(short), short)
     assert data.readings_after_last_frame > 10
     assert any("force readings come after the last frame with points" in doubt for doubt in data.data_warnings())
-    assert build_episode(twins.at(whole), replace(whole, grippers=hands)).readings_after_last_frame == 0
+    assert build_episode(twins.build_cloth_at(whole), replace(whole, grippers=hands)).readings_after_last_frame == 0
 
 
 def test_the_frame_of_a_time_is_the_nearest_one_that_is_the_same():

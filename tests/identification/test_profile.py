@@ -22,14 +22,14 @@ BEND = 1.0
 def toy(model=lambda raw: raw, loud=5.0):
     """The linear problem seen through ``model``, with so much noise that an error bar reaches far."""
     generator = torch.Generator().manual_seed(3)
-    jacobian = least_squares.sensitivities(generator)
-    data = jacobian @ least_squares.TRUE + loud * least_squares.noise(generator, 0.0)
-    return least_squares.Toy(lambda raw: jacobian @ model(raw), data, *least_squares.layout(), prior_std=1e4)
+    jacobian = least_squares.draw_jacobian(generator)
+    data = jacobian @ least_squares.TRUE_UNKNOWNS + loud * least_squares.draw_noise(generator, 0.0)
+    return least_squares.ToyProblem(lambda raw: jacobian @ model(raw), data, *least_squares.row_layout(), prior_std=1e4)
 
 
 def profiled(given, clip=lambda raw: raw, names="abc"):
     """(optimum, its covariance by the cost's own curvature, profiles by name)."""
-    final = solve(given, start=least_squares.TRUE.clone())
+    final = solve(given, start=least_squares.TRUE_UNKNOWNS.clone())
     covariance = torch.linalg.inv(levenberg_marquardt.robust_curvature(given.problem(), final))
     unknowns = [SimpleNamespace(name=n, clip=clip, value=lambda raw: raw) for n in "abc"]
     objective = SimpleNamespace(problem=given.problem, unknowns=unknowns)

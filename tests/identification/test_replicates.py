@@ -34,30 +34,34 @@ def repeats(seed, count, motions=1, hidden=HIDDEN, offset=0.0):
     generator = torch.Generator().manual_seed(seed)
     jacobian, data, frame, patch, episode = [], [], [], [], []
     for motion in range(motions):
-        of_part = least_squares.sensitivities(generator, FRAMES)
+        of_part = least_squares.draw_jacobian(generator, FRAMES)
         for _ in range(count):
             value = (
-                least_squares.TRUE + hidden * torch.randn(3, generator=generator, dtype=torch.float64) + offset * motion
+                least_squares.TRUE_UNKNOWNS
+                + hidden * torch.randn(3, generator=generator, dtype=torch.float64)
+                + offset * motion
             )
-            number, (t, where) = len(jacobian), least_squares.layout(FRAMES)
+            number, (t, where) = len(jacobian), least_squares.row_layout(FRAMES)
             jacobian.append(of_part)
-            data.append(of_part @ value + 0.1 * least_squares.noise(generator, 0.0, FRAMES))
+            data.append(of_part @ value + 0.1 * least_squares.draw_noise(generator, 0.0, FRAMES))
             frame.append(t + number * (FRAMES + DEFAULT_NOISE_MODEL.frames_per_time_block + 1))
             patch.append(where)
             episode.append(torch.full_like(t, number))
     J = torch.cat(jacobian)
-    toy = least_squares.Toy(lambda raw: J @ raw, torch.cat(data), torch.cat(frame), torch.cat(patch), prior_std=1e3)
+    toy = least_squares.ToyProblem(
+        lambda raw: J @ raw, torch.cat(data), torch.cat(frame), torch.cat(patch), prior_std=1e3
+    )
     return toy, torch.cat(episode)
 
 
 def result(seed, count, motions=1, strata=None, scatter=True, **options):
     toy, episode = repeats(seed, count, motions, **options)
-    at = minimise(toy.problem(), least_squares.TRUE.clone(), 20, lambda _: False)
+    at = minimise(toy.problem(), least_squares.TRUE_UNKNOWNS.clone(), 20, lambda _: False)
     matrix = covariance(toy.problem(), at)
     if scatter:
         strata = torch.zeros(count * motions, dtype=torch.int64) if strata is None else strata
         matrix = inflate_covariance(matrix, replicates.jackknife_variance(toy.problem(), at, episode, strata))
-    return at.raw - least_squares.TRUE, matrix.diagonal().sqrt()
+    return at.raw - least_squares.TRUE_UNKNOWNS, matrix.diagonal().sqrt()
 
 
 @pytest.mark.parametrize("count", [3, 6])
@@ -82,14 +86,14 @@ def test_errors_are_those_of_a_mean_of_episodes():
 def test_leaving_out_an_episode_moves_the_estimate_as_a_fit_shift_without_it_does():
     """Episodes that differ much: what was an outlier among all is none without the one that made the others small."""
     toy, episode = repeats(1, 3, hidden=0.5)
-    whole = minimise(toy.problem(), least_squares.TRUE.clone(), 20, lambda _: False)
+    whole = minimise(toy.problem(), least_squares.TRUE_UNKNOWNS.clone(), 20, lambda _: False)
     for e in range(3):
         stored = episode != e
-        J = torch.func.jacfwd(toy.model)(least_squares.TRUE)[stored]
-        alone = least_squares.Toy(
+        J = torch.func.jacfwd(toy.model)(least_squares.TRUE_UNKNOWNS)[stored]
+        alone = least_squares.ToyProblem(
             lambda raw, J=J: J @ raw, toy.data[stored], toy.frame[stored], toy.patch[stored], prior_std=1e3
         )
-        wanted = minimise(alone.problem(), least_squares.TRUE.clone(), 20, lambda _: False).raw - whole.raw
+        wanted = minimise(alone.problem(), least_squares.TRUE_UNKNOWNS.clone(), 20, lambda _: False).raw - whole.raw
         moved = replicates._shift_without(toy.problem(), whole, ~stored)
         assert float((moved - wanted).norm()) < 0.1 * float(wanted.norm())
 
@@ -97,7 +101,7 @@ def test_leaving_out_an_episode_moves_the_estimate_as_a_fit_shift_without_it_doe
 def test_episodes_shift_without_data_of_a_kind_do_not_scatter():
     """One of three alone has readings: without it there is no fit, and the others move nothing."""
     toy, episode = repeats(1, 3)
-    at = minimise(toy.problem(), least_squares.TRUE.clone(), 20, lambda _: False)
+    at = minimise(toy.problem(), least_squares.TRUE_UNKNOWNS.clone(), 20, lambda _: False)
     alone = torch.zeros_like(episode)
     assert torch.equal(
         replicates.jackknife_variance(toy.problem(), at, alone, torch.zeros(3).long()), torch.zeros_like(at.raw)

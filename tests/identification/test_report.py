@@ -6,7 +6,7 @@ from types import SimpleNamespace
 
 import pytest
 import torch
-from helpers.twins import at
+from helpers.twins import build_cloth_at
 
 import torchcloth as tc
 from torchcloth.episodes.observed import Episode
@@ -164,17 +164,17 @@ def test_identifiable_is_an_error_below_a_quarter(model):
 
 def test_a_default_prior_is_no_knowledge(recording):
     """That of a Poisson's ratio near one half is narrow beside its value."""
-    model = at(recording, poisson_ratio=0.4)
+    model = build_cloth_at(recording, poisson_ratio=0.4)
     assert not stated(model, [1.0], ["poisson_ratio"])["poisson_ratio"].identifiable
     assert stated(model, [0.3], ["poisson_ratio"])["poisson_ratio"].identifiable
-    stiff = at(recording, **{"bending.stiffness": 1e-3})
+    stiff = build_cloth_at(recording, **{"bending.stiffness": 1e-3})
     wide = collect_unknowns(stiff, ["bending.stiffness"], None)[0].prior_std
     assert not stated(stiff, [wide], ["bending.stiffness"])["bending.stiffness"].identifiable
 
 
 def test_an_amplitude_of_zero_can_be_known(recording):
     """No drag, known to 0.1 where 1.2 is typical, is a finding; its interval ends at zero."""
-    p = stated(at(recording, **{"air.normal": 0.0}), [0.1, 0.1])["air.normal"]
+    p = stated(build_cloth_at(recording, **{"air.normal": 0.0}), [0.1, 0.1])["air.normal"]
     assert p.identifiable
     assert p.ci95[0] == 0.0
     assert p.ci95[1] == pytest.approx(0.196, rel=1e-4)

@@ -156,7 +156,7 @@ def test_fingerprints_tell_apart_what_is_joined():
 def test_what_is_no_tensor_tells_problems_apart(recording, other):
     ids = []
     for made in (recording, other(recording)):
-        cloth = twins.at(made)
+        cloth = twins.build_cloth_at(made)
         objective = Objective(cloth, collect_unknowns(cloth, ["youngs_modulus"], None), [build_episode(cloth, made)])
         ids.append(digest(objective.fingerprint_parts()))
     assert ids[0] != ids[1]
@@ -177,7 +177,7 @@ def test_another_law_with_the_same_numbers_is_another_problem():
 
 def test_another_engine_is_another_problem(recording):
     """Its last digits differ, and a fit goes on bit by bit."""
-    cloth, ids = twins.at(recording), []
+    cloth, ids = twins.build_cloth_at(recording), []
     for cloth.engine in ("fused", "reference"):
         objective = Objective(
             cloth, collect_unknowns(cloth, ["youngs_modulus"], None), [build_episode(cloth, recording)]
@@ -188,10 +188,10 @@ def test_another_engine_is_another_problem(recording):
 
 def test_beginnings_of_several_episodes_are_told_apart(recording, tmp_path):
     """The first is so short that its beginning is all of it."""
-    both = [twins.first(twins.twin(seed=3), 4), recording]
+    both = [twins.take_first_frames(twins.make_twin(seed=3), 4), recording]
     names = ["youngs_modulus", "air.normal"]
-    plain = identify(twins.at(both[0]), both, names, iterations=1)
-    stored = identify(twins.at(both[0]), both, names, iterations=1, journal=tmp_path / "journal")
+    plain = identify(twins.build_cloth_at(both[0]), both, names, iterations=1)
+    stored = identify(twins.build_cloth_at(both[0]), both, names, iterations=1, journal=tmp_path / "journal")
     assert stored.parameters["youngs_modulus"].value == plain.parameters["youngs_modulus"].value
 
 

@@ -73,7 +73,7 @@ def test_a_residual_force_is_no_parameter_and_no_obstacle(model):
     assert "residual.strength" not in fit.default_parameters(cloth)
     fine = refine_cloth(cloth)
     assert fine.effects["residual"].gripped_vertices == (0, 1)
-    assert len(fine.effects["residual"].weights) == len(fine.mesh.vertices)
+    assert len(fine.effects["residual"].vertex_area) == len(fine.mesh.vertices)
 
 
 def test_fields_are_refused_before_anything_is_computed(model, recording):
@@ -117,11 +117,11 @@ def test_it_moves_towards_what_a_finer_mesh_finds(recording, model, plain):
 @pytest.mark.slow
 def test_a_mesh_that_is_fine_already_is_hardly_corrected(recording):
     """With the truth's own spacing halved the step is below a standard error."""
-    fine = refine_cloth(twins.at(recording))
-    episode = refine_recording(recording, twins.at(recording).mesh, fine.mesh)
+    fine = refine_cloth(twins.build_cloth_at(recording))
+    episode = refine_recording(recording, twins.build_cloth_at(recording).mesh, fine.mesh)
     coarse, finer = (
         identify(c, r, PAIR, refine=True).fit["mesh_correction"]
-        for c, r in ((twins.at(recording), recording), (fine, episode))
+        for c, r in ((twins.build_cloth_at(recording), recording), (fine, episode))
     )
     assert finer < 0.6 * coarse
     assert finer < 1.0
@@ -146,8 +146,8 @@ def test_a_late_clock_is_no_difference_between_meshes(recording):
     moved = {n: _later(g, 0.03) for n, g in late.grippers.items()}  # frames were taken 30 ms after they say
     late = replace(late, grippers=moved)
     names, clock = ["youngs_modulus", "air.normal"], {"clock": 0.03}
-    result = identify(twins.at(late), late, names, nuisances=clock, refine=True).parameters["air.normal"]
-    assert result.value == pytest.approx(twins.TRUE.drag, abs=3 * result.std)
+    result = identify(twins.build_cloth_at(late), late, names, nuisances=clock, refine=True).parameters["air.normal"]
+    assert result.value == pytest.approx(twins.TRUE_FABRIC.drag, abs=3 * result.std)
     assert result.std < 0.05
 
 

@@ -29,8 +29,8 @@ def test_start_values_that_were_not_fitted_are_kept(pair, tmp_path):
     """`pair` fits stiffness and air; the rest is the data sheet's."""
     pair.save(tmp_path)
     values = read_saved_fit(tmp_path / "identification.json").values
-    assert values["poisson_ratio"] == pytest.approx(twins.NOMINAL.poisson)
-    assert values["bending.damping_time"] == pytest.approx(twins.NOMINAL.damping_time)
+    assert values["poisson_ratio"] == pytest.approx(twins.NOMINAL_FABRIC.poisson)
+    assert values["bending.damping_time"] == pytest.approx(twins.NOMINAL_FABRIC.damping_time)
     assert values["youngs_modulus"] == pair.parameters["youngs_modulus"].value != pytest.approx(2e4)
 
 
@@ -87,14 +87,14 @@ def test_a_file_of_another_schema_is_refused(pair, recording, tmp_path, schema, 
 
 
 def test_the_right_one_of_several_episodes_is_found(recording, brief, tmp_path):
-    fit = identify(twins.at(brief), [brief, recording], ["youngs_modulus"], iterations=1)
+    fit = identify(twins.build_cloth_at(brief), [brief, recording], ["youngs_modulus"], iterations=1)
     fit.save(tmp_path)
     for number, one in enumerate((brief, recording)):
         again = replay_fit(tmp_path, one)
         torch.testing.assert_close(again.frames, fit.frames_after[number], rtol=0, atol=1e-9)
         assert again.warning == ""
         assert again.was_fitted
-    again = replay_fit(tmp_path, twins.first(recording, 5))
+    again = replay_fit(tmp_path, twins.take_first_frames(recording, 5))
     assert not again.was_fitted
     assert again.warning == ""
 
@@ -112,7 +112,7 @@ def blown(cloth):
 )
 def test_what_no_episode_describes_is_not_left_out_silently(brief, tmp_path, key, part, said):
     """A diagnosis has found a tilt or a wind, and the fabric is fitted anew beside it."""
-    cloth = twins.at(brief)
+    cloth = twins.build_cloth_at(brief)
     cloth.effects[key] = part(cloth)
     identify(cloth, brief, ["youngs_modulus"], iterations=1).save(tmp_path)
     for read in (load_fitted_cloth, predict_episode, replay_fit):
@@ -121,10 +121,10 @@ def test_what_no_episode_describes_is_not_left_out_silently(brief, tmp_path, key
 
 
 def test_precision_and_mesh_are_no_other_model(brief):
-    assert find_unrecorded_settings(twins.at(brief).double(), brief) == []
+    assert find_unrecorded_settings(twins.build_cloth_at(brief).double(), brief) == []
     assert find_unrecorded_settings(build_cloth(brief, contact=Contact(0.05)), brief) == []
     finer = replace(brief, cloth=replace(brief.cloth, vertices=None, faces=None, sheet=(0.3, 0.3)))
-    assert find_unrecorded_settings(twins.at(brief), finer) == []
+    assert find_unrecorded_settings(twins.build_cloth_at(brief), finer) == []
     thin = build_cloth(replace(brief, cloth=replace(brief.cloth, thickness=5e-4)))
     assert find_unrecorded_settings(thin, brief) == ["material.thickness"]
     nothing = replace(brief, cloth=replace(brief.cloth, vertices=None, faces=None, sheet=None))

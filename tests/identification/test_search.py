@@ -127,7 +127,7 @@ def test_starts_are_spread_over_two_decades(model):
 
 
 def test_starts_that_agree_are_counted():
-    toy, _ = least_squares.linear(0)
+    toy, _ = least_squares.make_linear_problem(0)
     ends = [solve(toy), solve(toy, start=torch.tensor([1.0, -1.0, 0.5], dtype=torch.float64))]
     astray = ends[0]._replace(raw=ends[0].raw + 5.0)
     astray = levenberg_marquardt.evaluate_point(toy.problem(), astray.raw, toy._linearise(astray.raw))
@@ -140,7 +140,7 @@ def test_several_starts_are_reported(model, brief):
     fit = identify(model, brief, ["youngs_modulus"], starts=4, iterations=4)
     assert fit.fit["starts"] == 4
     assert fit.fit["starts_agreeing"] >= 3
-    assert fit.parameters["membrane_stiffness"].value == pytest.approx(twins.TRUE.membrane, rel=0.15)
+    assert fit.parameters["membrane_stiffness"].value == pytest.approx(twins.TRUE_FABRIC.membrane, rel=0.15)
 
 
 # -- priors ----------------------------------------------------------------------------------------------------------

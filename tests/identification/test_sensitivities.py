@@ -2,7 +2,7 @@
 
 import pytest
 import torch
-from helpers.twins import at
+from helpers.twins import build_cloth_at
 
 from torchcloth.episodes.observed_surface import build_surface_of_mesh
 from torchcloth.episodes.replay import simulate, simulate_with_tangents
@@ -185,7 +185,7 @@ def test_two_episodes_have_frames_of_their_own(short):
 def test_a_zero_amplitude_keeps_its_sensitivity(recording, short):
     """Amplitudes are stored as they are: at zero a logarithm would have none."""
     _, _, seen = short
-    model = at(recording, **{"air.normal": 0.0})
+    model = build_cloth_at(recording, **{"air.normal": 0.0})
     unknowns = collect_unknowns(model, ["air.normal"], None)
     _, tangent = simulate_with_tangents(model, unknowns, torch.zeros(1), seen)
     assert float(tangent.x[0, -1].abs().max()) > 1e-3  # m per unit of the drag coefficient

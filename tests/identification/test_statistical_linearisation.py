@@ -32,7 +32,7 @@ RIPPLES = 3e-3  # m
 def swung(tmp_path_factory):
     """What ``torchcloth simulate`` makes of a sheet of 129 N/m and 1e-5 N m that is swung, for a second and a third."""
     order = synthesis.EpisodeSpec("sheet", "swing", fabric="dress", triangles=98, arms=False)
-    with twins.doubles():
+    with twins.use_float64():
         made = synthesis.make_episode(order, tmp_path_factory.mktemp("images"))
     frames, count = 20, int(made.points.counts[:20].sum())
     points = recordings.PointClouds(made.points.t[:frames], made.points.xyz[:count], made.points.counts[:frames])
@@ -91,14 +91,14 @@ class Rippling:
 
     def __init__(self, seed: int, blind: bool = False) -> None:
         generator = torch.Generator().manual_seed(seed)
-        self.slopes = least_squares.sensitivities(generator)
+        self.slopes = least_squares.draw_jacobian(generator)
         if blind:
             self.slopes[:, 2] = 0.0  # nothing tells the third
-        self.frame, self.patch = least_squares.layout()
+        self.frame, self.patch = least_squares.row_layout()
         rows, windows = len(self.frame), int(self.frame.max()) + 1
-        self.waves = 400 * torch.randn(windows, least_squares.PATCHES, 3, generator=generator, dtype=torch.float64)
-        self.phase = 6 * torch.rand(windows, least_squares.PATCHES, generator=generator, dtype=torch.float64)
-        self.data = self._shown(least_squares.TRUE) + least_squares.SIGMA * torch.randn(
+        self.waves = 400 * torch.randn(windows, least_squares.PATCH_COUNT, 3, generator=generator, dtype=torch.float64)
+        self.phase = 6 * torch.rand(windows, least_squares.PATCH_COUNT, generator=generator, dtype=torch.float64)
+        self.data = self._shown(least_squares.TRUE_UNKNOWNS) + least_squares.SIGMA_M * torch.randn(
             rows, generator=generator, dtype=torch.float64
         )
         self.unknowns, self.start, self.simulations = [0, 1, 2], torch.zeros(3, dtype=torch.float64), 0
@@ -112,7 +112,7 @@ class Rippling:
     def problem(self):
         one = torch.ones(3, dtype=torch.float64)
         return levenberg_marquardt.Problem(
-            None, None, self.clip, 0 * one, self.prior_std, one, torch.tensor([least_squares.SIGMA])
+            None, None, self.clip, 0 * one, self.prior_std, one, torch.tensor([least_squares.SIGMA_M])
         )
 
     def clip(self, raw):
@@ -140,7 +140,7 @@ def test_simulations_around_a_point_see_through_ripples():
     for seed in range(20):
         result = statistical_linearisation.fit_by_sampling(Rippling(seed), FAILED, None, 8, lambda raw: None)
         deviation = result.covariance.diagonal().sqrt()
-        z.append((result.final.raw - least_squares.TRUE) / deviation)
+        z.append((result.final.raw - least_squares.TRUE_UNKNOWNS) / deviation)
         stds.append(deviation)
         assert result.final.converged
     z = torch.stack(z)

@@ -8,7 +8,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from helpers.off_axis_strips import NAMES, TRUTH, WARP, H, cloth, readings
+from helpers.off_axis_strips import (
+    MODULUS_NAMES,
+    THICKNESS_M,
+    TRUE_MODULI_PA,
+    WARP_MODULUS_PA,
+    make_readings,
+    make_start_cloth,
+)
 
 import torchcloth as tc
 from torchcloth.errors import InvalidInput
@@ -18,7 +25,7 @@ from torchcloth.recordings import ForceDisplacement
 
 def isotropic(E: float, nu: float) -> tc.Cloth:
     mesh = tc.meshes.rectangle(0.1, 0.1, triangles=8)
-    return tc.Cloth(mesh, tc.materials.AEP(E, nu, thickness=H), 0.1, contact=None)
+    return tc.Cloth(mesh, tc.materials.AEP(E, nu, thickness=THICKNESS_M), 0.1, contact=None)
 
 
 def test_three_moduli_from_three_directions():
@@ -26,8 +33,10 @@ def test_three_moduli_from_three_directions():
     result = []
     for seed in range(3):
         draw = np.random.default_rng(seed)
-        result.append(fit_tension(cloth(), [readings(a, 0.02, draw) for a in (0, 45, 90)], NAMES))
-    for name, truth in TRUTH.items():
+        result.append(
+            fit_tension(make_start_cloth(), [make_readings(a, 0.02, draw) for a in (0, 45, 90)], MODULUS_NAMES)
+        )
+    for name, truth in TRUE_MODULI_PA.items():
         values = np.array([f.parameters[name].value for f in result])
         errors = np.array([f.parameters[name].std for f in result])
         assert np.abs((values - truth) / errors).max() < 3.5, name
@@ -40,14 +49,14 @@ def test_three_moduli_from_three_directions():
 
 def test_what_the_data_do_not_see_is_not_identified():
     """Pulled along the warp only, weft and shear stay within their priors."""
-    fit = fit_tension(cloth(), readings(0, 0.01, np.random.default_rng(0)), NAMES)
-    assert fit.parameters["youngs_modulus"].value == pytest.approx(WARP, rel=0.02)
+    fit = fit_tension(make_start_cloth(), make_readings(0, 0.01, np.random.default_rng(0)), MODULUS_NAMES)
+    assert fit.parameters["youngs_modulus"].value == pytest.approx(WARP_MODULUS_PA, rel=0.02)
     assert fit.parameters["youngs_modulus"].identifiable
     assert not fit.parameters["weft_modulus"].identifiable
     assert not fit.parameters["shear_modulus"].identifiable
     assert sum("not identifiable" in w for w in fit.warnings) == 2
-    changed = fit.apply(cloth())
-    assert changed.material.youngs_modulus.value.item() == pytest.approx(WARP, rel=0.02)
+    changed = fit.apply(make_start_cloth())
+    assert changed.material.youngs_modulus.value.item() == pytest.approx(WARP_MODULUS_PA, rel=0.02)
     assert changed.material.weft_modulus.value.item() == pytest.approx(2e7)
 
 
@@ -64,7 +73,7 @@ def test_contraction_tells_the_poisson_ratio():
         width=0.02,
         angle=0.0,
         displacement=0.1 * strain,
-        force=5e5 * H * 0.02 * strain,
+        force=5e5 * THICKNESS_M * 0.02 * strain,
         lateral_strain=np.where(np.arange(60) % 7 == 3, np.nan, narrower),
     )
     fit = fit_tension(sheet, data, ["youngs_modulus", "poisson_ratio"])
@@ -80,15 +89,15 @@ def test_a_wrong_law_is_said():
     """An isotropic sheet cannot be soft along the warp and stiff along the weft."""
     sheet = isotropic(1e7, 0.1)
     draw = np.random.default_rng(0)
-    fit = fit_tension(sheet, [readings(a, 0.01, draw) for a in (0, 90)], ["youngs_modulus"])
+    fit = fit_tension(sheet, [make_readings(a, 0.01, draw) for a in (0, 90)], ["youngs_modulus"])
     assert sum("the law misses a force" in w for w in fit.warnings) >= 1
     assert max(e["force_max_after"] for e in fit.errors) > 0.5
 
 
 def test_saved_and_unchanged(tmp_path):
-    start = cloth()
+    start = make_start_cloth()
     before = {k: v.clone() for k, v in start.state_dict().items()}
-    fit = fit_tension(start, readings(0, 0.01, np.random.default_rng(0)), ["youngs_modulus"])
+    fit = fit_tension(start, make_readings(0, 0.01, np.random.default_rng(0)), ["youngs_modulus"])
     assert all(torch.equal(v, before[k]) for k, v in start.state_dict().items())
     stored = json.loads(fit.save(tmp_path / "out").read_text())
     assert stored["parameters"]["youngs_modulus"]["value"] == fit.parameters["youngs_modulus"].value
@@ -97,11 +106,11 @@ def test_saved_and_unchanged(tmp_path):
 
 
 def test_printed(capsys):
-    fit = fit_tension(cloth(), readings(0, 0.01, np.random.default_rng(0)), NAMES)
+    fit = fit_tension(make_start_cloth(), make_readings(0, 0.01, np.random.default_rng(0)), MODULUS_NAMES)
     print_tension(fit)
     lines = capsys.readouterr().out.splitlines()
     [row] = [line.split() for line in lines if "youngs_modulus " in line and "Pa" in line]
-    assert float(row[2]) == pytest.approx(WARP, rel=0.02)
+    assert float(row[2]) == pytest.approx(WARP_MODULUS_PA, rel=0.02)
     [unknown] = [line for line in lines if "weft_modulus " in line and "Pa" in line]
     assert "–" in unknown
     assert "not identifiable" in unknown
@@ -110,38 +119,38 @@ def test_printed(capsys):
 
 
 def test_what_is_refused():
-    data = readings(0, 0.01, np.random.default_rng(0))
+    data = make_readings(0, 0.01, np.random.default_rng(0))
     with pytest.raises(InvalidInput, match="one of"):
-        fit_tension(cloth(), data, ["stiffness"])
+        fit_tension(make_start_cloth(), data, ["stiffness"])
     with pytest.raises(InvalidInput, match="tables"):
-        fit_tension(cloth(), [])
+        fit_tension(make_start_cloth(), [])
     with pytest.raises(InvalidInput, match=r"tables\[0\].width; got nan m; expected a length > 0"):
-        fit_tension(cloth(), replace(data, width=float("nan")))
+        fit_tension(make_start_cloth(), replace(data, width=float("nan")))
     with pytest.raises(InvalidInput, match="none above the preload"):
-        fit_tension(cloth(), replace(data, preload=1e3))
+        fit_tension(make_start_cloth(), replace(data, preload=1e3))
     with pytest.raises(InvalidInput, match="no change of width"):
-        fit_tension(cloth(), replace(data, lateral_strain=np.full(len(data), np.nan)))
+        fit_tension(make_start_cloth(), replace(data, lateral_strain=np.full(len(data), np.nan)))
     with pytest.raises(InvalidInput, match="at least one name"):
-        fit_tension(cloth(), data, [])
+        fit_tension(make_start_cloth(), data, [])
 
 
 def test_errors_do_not_hang_on_how_densely_a_curve_was_read():
     """A law that is not quite right errs smoothly: read ten times as often, the error had been said to be half."""
     stds = []
     for count in (40, 400):
-        table = readings(0, 0.0, np.random.default_rng(0), count)
+        table = make_readings(0, 0.0, np.random.default_rng(0), count)
         along = table.displacement / table.displacement.max()
         bent = table.force + 0.01 * table.force.max() * np.sin(9 * along)
-        result = fit_tension(cloth(), replace(table, force=bent), ["youngs_modulus"])
+        result = fit_tension(make_start_cloth(), replace(table, force=bent), ["youngs_modulus"])
         stds.append(result.parameters["youngs_modulus"].std)
     assert stds[1] == pytest.approx(stds[0], rel=0.2)
 
 
 def test_a_law_that_stiffens_is_kept_with_its_numbers(tmp_path):
     mesh = tc.meshes.rectangle(0.1, 0.1, triangles=8)
-    law = tc.materials.StiffeningAEP(4e7, 0.01, thickness=H)
+    law = tc.materials.StiffeningAEP(4e7, 0.01, thickness=THICKNESS_M)
     sheet = tc.Cloth(mesh, law, 0.1, contact=None)
-    fit = fit_tension(sheet, readings(0, 0.01, np.random.default_rng(0)), "youngs_modulus")
+    fit = fit_tension(sheet, make_readings(0, 0.01, np.random.default_rng(0)), "youngs_modulus")
     again = read_tension_model(fit.save(tmp_path))
     assert type(again.material) is tc.materials.StiffeningAEP
     assert again.material.youngs_modulus.value.item() == pytest.approx(fit.parameters["youngs_modulus"].value)
@@ -152,10 +161,10 @@ def test_what_specimens_differ_by_widens_the_error():
     z, stated = [], []
     for seed in range(12):
         draw = np.random.default_rng(seed)
-        tables = [readings(0, 0.005, draw) for _ in range(6)]
+        tables = [make_readings(0, 0.005, draw) for _ in range(6)]
         tables = [replace(t, force=t.force * (1 + 0.05 * draw.normal())) for t in tables]
-        result = fit_tension(cloth(), tables, ["youngs_modulus"]).parameters["youngs_modulus"]
-        z.append((result.value - WARP) / result.std)
-        stated.append(result.std / WARP)
+        result = fit_tension(make_start_cloth(), tables, ["youngs_modulus"]).parameters["youngs_modulus"]
+        z.append((result.value - WARP_MODULUS_PA) / result.std)
+        stated.append(result.std / WARP_MODULUS_PA)
     assert 0.018 < np.mean(stated) < 0.035  # 5 % / sqrt(6) = 2.0 %, times Student's 1.3
     assert np.mean(np.abs(z) < 1.96) > 0.8

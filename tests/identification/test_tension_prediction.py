@@ -9,7 +9,7 @@ from math import radians
 import numpy as np
 import pytest
 import torch
-from helpers.off_axis_strips import NAMES, H, cloth, modulus, readings
+from helpers.off_axis_strips import MODULUS_NAMES, THICKNESS_M, make_readings, make_start_cloth, off_axis_modulus
 
 from torchcloth.errors import InvalidInput, RecordingError
 from torchcloth.identification import cross_validate, fit_tension, make_specimen, predict_tension, read_tension_model
@@ -23,13 +23,13 @@ ANGLES = (0, 45, 90)
 @pytest.fixture(scope="module")
 def tables():
     draw = np.random.default_rng(1)
-    return [readings(a, 0.03, draw, count=20) for a in ANGLES]
+    return [make_readings(a, 0.03, draw, count=20) for a in ANGLES]
 
 
 @pytest.fixture(scope="module")
 def fit(tables):
     torch.set_default_dtype(torch.float64)
-    return fit_tension(cloth(), tables, NAMES)
+    return fit_tension(make_start_cloth(), tables, MODULUS_NAMES)
 
 
 def strip(degrees: float, rows: int = 11, preload: float = 0.0) -> ForceDisplacement:
@@ -44,7 +44,7 @@ def strip(degrees: float, rows: int = 11, preload: float = 0.0) -> ForceDisplace
 def test_the_closed_form_lies_in_the_interval(fit, degrees):
     """The law is right: the parameters' part alone holds Jones's modulus, and is not wider than it needs to be."""
     result = predict_tension(fit.model, strip(degrees)).force
-    truth = modulus(degrees) * H * 0.02 * 1e-3
+    truth = off_axis_modulus(degrees) * THICKNESS_M * 0.02 * 1e-3
     assert abs(result.value[-1] - truth) < 3 * result.parameter_std[-1]
     assert result.parameter_std[-1] < 0.03 * truth
 
@@ -68,17 +68,17 @@ def test_a_wrong_law_widens_the_interval_until_it_covers(tables):
     Without tables left out the fit bends to the wrong curve and promises too much.
     """
     draw = np.random.default_rng(2)
-    four = [*tables, readings(60, 0.03, draw, count=20)]
+    four = [*tables, make_readings(60, 0.03, draw, count=20)]
     four[1] = replace(four[1], force=1.3 * four[1].force)
-    fit = fit_tension(cloth(), four, NAMES)
-    *parts, whole = cross_validate(fit, cloth(), four)
+    fit = fit_tension(make_start_cloth(), four, MODULUS_NAMES)
+    *parts, whole = cross_validate(fit, make_start_cloth(), four)
     assert len(parts) == 4
     assert whole.parameters == fit.parameters
     plain, checked = (predict_tension(m, strip(30)).force for m in (fit.model, whole.model))
     assert checked.misfit_std[-1] > 1.3 * plain.misfit_std[-1]
     assert np.array_equal(checked.parameter_std, plain.parameter_std)
     low, high = checked.ci95
-    truth = modulus(30) * H * 0.02 * strip(30).strain
+    truth = off_axis_modulus(30) * THICKNESS_M * 0.02 * strip(30).strain
     assert ((low <= truth) & (truth <= high)).all()
     missed = whole.model.tables[1].left_out_misfit["force"]
     share = 0.3 / 1.3 * np.sqrt(np.mean(four[1].strain ** 2) / (four[1].strain.mean() * four[1].strain.max()))
@@ -87,21 +87,21 @@ def test_a_wrong_law_widens_the_interval_until_it_covers(tables):
 
 def test_a_direction_is_left_out_with_all_its_tables(tables):
     """Of two strips at 45 degrees either tells what the other reads, and nothing of the law between directions."""
-    twice = [*tables, readings(45, 0.03, np.random.default_rng(5), count=20)]
-    *parts, whole = cross_validate(fit_tension(cloth(), twice, NAMES), cloth(), twice)
+    twice = [*tables, make_readings(45, 0.03, np.random.default_rng(5), count=20)]
+    *parts, whole = cross_validate(fit_tension(make_start_cloth(), twice, MODULUS_NAMES), make_start_cloth(), twice)
     assert [len(part.model.tables) for part in parts] == [3, 2, 3]
     assert whole.model.tables[1].left_out_misfit["force"] == pytest.approx(
         whole.model.tables[3].left_out_misfit["force"], abs=0.05
     )
     with pytest.raises(InvalidInput, match="got 2 directions"):
-        next(cross_validate(whole, cloth(), [twice[0], twice[1], twice[3]]))
+        next(cross_validate(whole, make_start_cloth(), [twice[0], twice[1], twice[3]]))
 
 
 def test_a_table_whose_miss_the_numbers_errors_explain_says_nothing_of_the_law():
     """Of three angles, the two at the ends leave the shear modulus open, whatever the third one reads."""
     draw = np.random.default_rng(2)
-    three = [readings(angle, 0.03, draw, count=20) for angle in (0, 45, 90)]
-    *_, whole = cross_validate(fit_tension(cloth(), three, NAMES), cloth(), three)
+    three = [make_readings(angle, 0.03, draw, count=20) for angle in (0, 45, 90)]
+    *_, whole = cross_validate(fit_tension(make_start_cloth(), three, MODULUS_NAMES), make_start_cloth(), three)
     assert whole.model.tables[1].left_out_misfit == {"force": None, "lateral": None}
     assert "45" not in predict_tension(whole.model, strip(30)).misfit_source
 
@@ -119,7 +119,7 @@ def test_where_the_laws_part_comes_from_is_said(fit, tables):
     beyond = predict_tension(fit.model, replace(strip(30), displacement=np.linspace(0, 2e-4, 11)))
     assert any("beyond the strains" in w for w in beyond.warnings)
     with pytest.raises(InvalidInput, match="tables; got 2 directions; expected three or more"):
-        next(cross_validate(fit, cloth(), tables[:2]))
+        next(cross_validate(fit, make_start_cloth(), tables[:2]))
 
 
 def test_through_the_disk(fit, tmp_path):
@@ -135,10 +135,13 @@ def test_through_the_disk(fit, tmp_path):
 def test_a_preload_that_was_not_measured_is_that_of_the_same_slack(fit):
     """Strips that begin 2e-4 taut: one at 30 degrees has a preload of its modulus times that."""
     taut = 2e-4
-    begun = [replace(t, preload=modulus(a) * H * 0.02 * taut) for a, t in zip(ANGLES, fit.model.tables, strict=True)]
+    begun = [
+        replace(t, preload=off_axis_modulus(a) * THICKNESS_M * 0.02 * taut)
+        for a, t in zip(ANGLES, fit.model.tables, strict=True)
+    ]
     model = replace(fit.model, tables=begun)
     table, std = make_specimen(model, radians(30))
-    assert table.preload == pytest.approx(modulus(30) * H * 0.02 * taut, rel=0.05)
+    assert table.preload == pytest.approx(off_axis_modulus(30) * THICKNESS_M * 0.02 * taut, rel=0.05)
     assert std < 0.1 * table.preload
     result = predict_tension(model, table, preload_std=0.01).force
     assert result.setup_std == pytest.approx(np.full(len(table), 0.01), rel=0.05), "a constant force more"
@@ -147,7 +150,7 @@ def test_a_preload_that_was_not_measured_is_that_of_the_same_slack(fit):
 
 def test_coverage_of_readings(fit):
     """White noise of 3 % beside an interval of the mean: the law's part, which holds it, covers nearly all."""
-    seen = readings(30, 0.03, np.random.default_rng(5))
+    seen = make_readings(30, 0.03, np.random.default_rng(5))
     judged = predict_tension(fit.model, seen).compare_with_readings()["force"]
     assert judged["coverage"] > 0.8
     assert judged["rms"] == pytest.approx(0.03, rel=0.4)

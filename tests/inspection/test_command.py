@@ -4,7 +4,7 @@ import json
 
 import numpy as np
 import pytest
-from helpers.swinging_cloth import episode, markers
+from helpers.swinging_cloth import make_episode, make_markers
 
 from torchcloth import recordings
 from torchcloth.cli import main
@@ -12,8 +12,8 @@ from torchcloth.cli import main
 
 @pytest.fixture
 def folder(tmp_path):
-    stream = markers(lag=0.1, extra={"grid": np.array([8, 8])})
-    return recordings.write(episode(markers=stream), tmp_path / "episode")
+    stream = make_markers(lag=0.1, extra={"grid": np.array([8, 8])})
+    return recordings.write(make_episode(markers=stream), tmp_path / "episode")
 
 
 def test_tables_a_result_and_a_picture(folder, tmp_path, capsys):
@@ -68,7 +68,7 @@ def test_depth_images_are_summarised_and_a_damaged_one_is_one_line(tmp_path, cap
         image.fromarray(encode_depth(depth)).save(paths[-1])
     stream = recordings.ImageStream("depth", np.arange(3), np.arange(3) / 30, tuple(paths), (640, 576))
     recorded = recordings.Camera(**camera.to_calibration(), depth_scale=0.001, depth=stream)
-    folder = recordings.write(episode(cameras={"cam0": recorded}), tmp_path / "episode")
+    folder = recordings.write(make_episode(cameras={"cam0": recorded}), tmp_path / "episode")
     assert main(["inspect", str(folder), "--json"]) == 0
     result = json.loads(capsys.readouterr().out)
     assert result["depth"]["cam0"]["invalid_fraction"] == pytest.approx(0.25)

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from helpers.swinging_cloth import clouds, episode, markers, motion, path, pattern
+from helpers.swinging_cloth import gripper_path, make_clouds, make_episode, make_markers, make_motion, node_pattern
 
 from torchcloth import meshes
 from torchcloth import recordings as rec
@@ -22,8 +22,8 @@ GRID = {"extra": {"grid": np.array([8, 8])}}
     ("observed", "lag"), [("markers", 0.32), ("markers", -0.15), ("points", 0.0), ("points", 0.32)]
 )
 def test_the_lag_is_found_within_its_error(lag, observed, needs_open3d):
-    stream = {"markers": markers(lag=lag, **GRID)} if observed == "markers" else {"points": clouds(lag=lag)}
-    result = inspect(episode(**stream)).lag
+    stream = {"markers": make_markers(lag=lag, **GRID)} if observed == "markers" else {"points": make_clouds(lag=lag)}
+    result = inspect(make_episode(**stream)).lag
     assert result.is_determined
     assert result.std < 0.02
     assert abs(result.value - lag) < max(3 * result.std, 0.01)
@@ -31,7 +31,7 @@ def test_the_lag_is_found_within_its_error(lag, observed, needs_open3d):
 
 
 def test_a_lag_that_the_recording_states_is_no_news():
-    recording = replace(episode(markers=markers(lag=0.2, **GRID)), clock_offset=-0.2)
+    recording = replace(make_episode(markers=make_markers(lag=0.2, **GRID)), clock_offset=-0.2)
     report = inspect(recording)
     assert report.lag.value == pytest.approx(0.2, abs=0.01)
     assert report.lag.recorded == 0.2
@@ -41,7 +41,7 @@ def test_a_lag_that_the_recording_states_is_no_news():
 
 def test_an_arm_that_holds_nothing_is_drawn_and_not_followed():
     """It moves on its own, also while the cloth stands: neither lag nor noise are its business."""
-    recording = episode(markers=markers(lag=0.1, **GRID))
+    recording = make_episode(markers=make_markers(lag=0.1, **GRID))
     alone, hand = inspect(recording), recording.grippers["hand"]
     idle = np.stack([0.8 + 0.1 * np.sin(3.1 * hand.t), 0.1 * np.cos(2.3 * hand.t), 0.4 + 0 * hand.t], -1)
     grasp = rec.GraspInfo(uv=np.array([[0.15, 0.3]]), radius=0.02)
@@ -56,7 +56,7 @@ def test_an_arm_that_holds_nothing_is_drawn_and_not_followed():
 
 def test_its_standard_error_is_not_too_small_and_not_worlds_too_large():
     """It allows for errors that last, of which white noise has none."""
-    values = [inspect(episode(markers=markers(noise=0.01, seed=seed, **GRID))).lag for seed in range(8)]
+    values = [inspect(make_episode(markers=make_markers(noise=0.01, seed=seed, **GRID))).lag for seed in range(8)]
     scatter, stated = np.std([v.value for v in values]), np.median([v.std for v in values])
     assert 0.7 * scatter < stated < 6 * scatter + 0.003  # a spread of eight is known to a quarter
 
@@ -64,9 +64,14 @@ def test_its_standard_error_is_not_too_small_and_not_worlds_too_large():
 def test_a_motion_at_constant_speed_determines_no_lag():
     t = np.arange(0, 8, 0.02)
     straight = np.stack([0 * t, 0.1 * t, 0 * t + 0.5], -1)
-    recording = episode(markers=markers(**GRID))
+    recording = make_episode(markers=make_markers(**GRID))
     stream = recording.markers
-    xyz = stream.xyz - path(stream.t)[:, None] + np.array([0, 0.1, 0]) * stream.t[:, None, None] + np.array([0, 0, 0.5])
+    xyz = (
+        stream.xyz
+        - gripper_path(stream.t)[:, None]
+        + np.array([0, 0.1, 0]) * stream.t[:, None, None]
+        + np.array([0, 0, 0.5])
+    )
     quat, closed = np.tile([1.0, 0, 0, 0], (400, 1)), np.ones(400, bool)
     steady = rec.GripperMotion(t, straight, quat, closed)
     report = inspect(replace(recording, grippers={"hand": steady}, markers=replace(stream, xyz=xyz)))
@@ -76,7 +81,7 @@ def test_a_motion_at_constant_speed_determines_no_lag():
 
 @pytest.mark.parametrize("noise", [0.001, 0.004])
 def test_static_noise_is_what_was_added(noise, needs_open3d):
-    report = inspect(episode(markers=markers(noise=noise, **GRID), points=clouds(noise=noise)))
+    report = inspect(make_episode(markers=make_markers(noise=noise, **GRID), points=make_clouds(noise=noise)))
     assert report.noise["markers"].std == pytest.approx(noise, rel=0.15)
     assert report.noise["markers"].std_xyz == pytest.approx((noise,) * 3, rel=0.15)
     assert "at rest" in report.noise["markers"].method
@@ -85,25 +90,25 @@ def test_static_noise_is_what_was_added(noise, needs_open3d):
 
 
 def test_noise_in_one_direction_is_measured_along_it():
-    stream = markers(noise=0.0, **GRID)
+    stream = make_markers(noise=0.0, **GRID)
     ray = np.array([1.0, 1.0, 0.0]) / np.sqrt(2)
     scatter = np.random.default_rng(0).standard_normal((*stream.xyz.shape[:2], 1))
-    result = inspect(episode(markers=replace(stream, xyz=stream.xyz + 0.003 * scatter * ray))).noise["markers"]
+    result = inspect(make_episode(markers=replace(stream, xyz=stream.xyz + 0.003 * scatter * ray))).noise["markers"]
     assert result.std == pytest.approx(0.003, rel=0.1)
     assert result.std_xyz[2] < 1e-4
 
 
 @pytest.mark.parametrize("known", ["grid", "uv", "neither"])
 def test_frames_of_another_size_are_rejected_and_no_others(known):
-    extra = {"grid": GRID, "uv": {"uv": pattern()}, "neither": {}}[known]
-    stream = markers(noise=0.001, **extra)
+    extra = {"grid": GRID, "uv": {"uv": node_pattern()}, "neither": {}}[known]
+    stream = make_markers(noise=0.001, **extra)
     spoiled = stream.xyz.copy()
     middle = spoiled.mean(1, keepdims=True)
     spoiled[10:15] = (middle + 1.15 * (spoiled - middle))[10:15]
     spoiled[40] = (middle + 0.8 * (spoiled - middle))[40]
     spoiled[60] = np.nan
     spoiled[5:9, ::7] = np.nan  # unseen, not wrong
-    result = inspect(episode(markers=replace(stream, xyz=spoiled))).frames["markers"]
+    result = inspect(make_episode(markers=replace(stream, xyz=spoiled))).frames["markers"]
     np.testing.assert_array_equal(np.flatnonzero(result.rejected), [10, 11, 12, 13, 14, 40, 60])
     assert result.coverage[60] == 0
     assert result.coverage[5] == pytest.approx(54 / 64)
@@ -115,29 +120,29 @@ def test_frames_of_another_size_are_rejected_and_no_others(known):
 )
 def test_a_grid_that_does_not_fit_is_refused(grid):
     with pytest.raises(RecordingError, match="grid"):
-        inspect(episode(markers=markers(extra={"grid": grid})))
+        inspect(make_episode(markers=make_markers(extra={"grid": grid})))
 
 
 def test_material_points_go_before_a_grid():
     """Markers set in from the edge are no grid over the whole sheet."""
-    stream = markers(noise=0.001, uv=pattern())
-    inner = np.abs(pattern() - pattern().mean(0)).max(1) < 0.8 * np.ptp(pattern(), axis=0).max() / 2
+    stream = make_markers(noise=0.001, uv=node_pattern())
+    inner = np.abs(node_pattern() - node_pattern().mean(0)).max(1) < 0.8 * np.ptp(node_pattern(), axis=0).max() / 2
     side = int(inner.sum() ** 0.5)
     assert side**2 == inner.sum() < 64
     inner_markers = rec.Markers(stream.t, stream.xyz[:, inner], stream.uv[inner], {"grid": np.array([side, side])})
-    assert not inspect(episode(markers=inner_markers)).frames["markers"].rejected.any()
+    assert not inspect(make_episode(markers=inner_markers)).frames["markers"].rejected.any()
 
 
 @pytest.mark.filterwarnings("error")
 @pytest.mark.parametrize("frames", [1, 3, 12, 84])
 def test_sparse_streams_are_inspected_without_warnings(frames, needs_open3d, tmp_path):
-    stream = markers(extra={})
+    stream = make_markers(extra={})
     xyz = stream.xyz[:frames].copy()
     xyz[np.random.default_rng(0).random(xyz.shape[:2]) < 0.7] = np.nan
     sparse = rec.Markers(stream.t[:frames], xyz)
     single = rec.PointClouds(stream.t[:frames], np.zeros((frames, 3)), np.ones(frames, int))
-    for paths in (episode().grippers, {}, {"hand": motion(length=0.5)}):
-        report = inspect(replace(episode(markers=sparse, points=single), grippers=paths))
+    for paths in (make_episode().grippers, {}, {"hand": make_motion(length=0.5)}):
+        report = inspect(replace(make_episode(markers=sparse, points=single), grippers=paths))
         json.dumps(report.as_dict(), allow_nan=False)
         assert draw(report, tmp_path).is_file()
 
@@ -145,14 +150,14 @@ def test_sparse_streams_are_inspected_without_warnings(frames, needs_open3d, tmp
 def test_an_arm_that_is_not_known_is_a_note():
     t = np.arange(5) / 10
     arm = {"left": rec.JointMotion(t, np.zeros((5, 7)))}
-    report = inspect(replace(episode(markers=markers(**GRID)), grippers={}, joints=arm))
+    report = inspect(replace(make_episode(markers=make_markers(**GRID)), grippers={}, joints=arm))
     assert any("left" in note and "no lag" in note for note in report.notes)
 
 
 def test_a_wrong_size_throughout_is_seen_where_the_size_is_known():
-    stream = markers(**GRID)
+    stream = make_markers(**GRID)
     large = replace(stream, xyz=1.2 * stream.xyz)
-    assert inspect(episode(markers=large)).frames["markers"].rejected.all()
+    assert inspect(make_episode(markers=large)).frames["markers"].rejected.all()
 
 
 def test_a_cloth_whose_mesh_lies_folded_may_be_seen_open(needs_open3d):
@@ -160,22 +165,22 @@ def test_a_cloth_whose_mesh_lies_folded_may_be_seen_open(needs_open3d):
     folded = mesh.vertices * 1.0
     folded[:, 0] = np.abs(folded[:, 0] - 0.15)
     cloth = rec.ClothInfo(areal_density=0.2, vertices=folded, faces=mesh.faces, uv=mesh.uv)
-    assert not inspect(replace(episode(points=clouds()), cloth=cloth)).frames["points"].rejected.any()
+    assert not inspect(replace(make_episode(points=make_clouds()), cloth=cloth)).frames["points"].rejected.any()
 
 
 def test_clouds_outliers_crop_area_and_strangers(needs_open3d):
-    stream = clouds(noise=0.001, count=800)
+    stream = make_clouds(noise=0.001, count=800)
     rng = np.random.default_rng(1)
     frames = [stream.frame(i) for i in range(len(stream))]
     for i, frame in enumerate(frames):
         frames[i] = np.concatenate([frame[frame[:, 2] > 0.3], frame.mean(0) + rng.uniform(0.3, 0.6, (5, 3))])
     frames[20] = frames[20] * 2.0
     spoiled = rec.PointClouds(stream.t, np.concatenate(frames), np.array([len(f) for f in frames]))
-    result = inspect(episode(points=spoiled)).frames["points"]
+    result = inspect(make_episode(points=spoiled)).frames["points"]
     assert np.flatnonzero(result.rejected).tolist() == [20]
     assert sum(result.removed.values()) == pytest.approx(5 * len(frames), rel=0.2)
     assert result.crop_planes == {"z >": pytest.approx(0.3, abs=2e-3)}
-    uncropped = inspect(episode(points=stream)).frames["points"]
+    uncropped = inspect(make_episode(points=stream)).frames["points"]
     assert uncropped.crop_planes == {}
     assert np.median(uncropped.coverage) == pytest.approx(1.0, abs=0.1)
     assert np.median(result.coverage) < 0.85 * np.median(uncropped.coverage)  # 0.5 m - 0.3 m of the 0.3 m are left
@@ -236,7 +241,7 @@ def test_ticks_gaps_and_jitter():
 
 
 def test_an_episode_without_observations_says_so(capsys, tmp_path):
-    report = inspect(episode())
+    report = inspect(make_episode())
     assert report.lag is None
     assert report.noise == report.frames == {}
     assert any("nothing to compare" in note for note in report.notes)
@@ -246,21 +251,21 @@ def test_an_episode_without_observations_says_so(capsys, tmp_path):
 
 
 def test_without_motion_there_is_no_lag():
-    report = inspect(replace(episode(markers=markers(**GRID)), grippers={}))
+    report = inspect(replace(make_episode(markers=make_markers(**GRID)), grippers={}))
     assert report.lag is None
     assert "markers" in report.frames
     assert report.noise == {}
 
 
 def test_without_motion_nobody_knows_which_frames_are_still(needs_open3d):
-    seen = clouds()
-    none, some = (inspect(replace(episode(points=seen), **change)) for change in ({"grippers": {}}, {}))
+    seen = make_clouds()
+    none, some = (inspect(replace(make_episode(points=seen), **change)) for change in ({"grippers": {}}, {}))
     assert none.noise["points"].method.endswith("in all frames, because without grippers still frames are unknown")
     assert "without grippers" not in some.noise["points"].method
 
 
 def test_names_are_no_formulas(tmp_path, needs_open3d):
-    recording = episode(points=clouds())
+    recording = make_episode(points=make_clouds())
     odd = replace(
         recording, grippers={"a $x_{$ b": recording.grippers["hand"]}, cloth=replace(recording.cloth), grasps={}
     )
@@ -268,7 +273,7 @@ def test_names_are_no_formulas(tmp_path, needs_open3d):
 
 
 def test_the_report_is_json_and_a_picture(tmp_path, capsys, needs_open3d):
-    report = inspect(episode(markers=markers(lag=0.1, **GRID), points=clouds(lag=0.1)))
+    report = inspect(make_episode(markers=make_markers(lag=0.1, **GRID), points=make_clouds(lag=0.1)))
     stored = json.loads(json.dumps(report.as_dict(), allow_nan=False))
     assert stored["lag"]["value"] == pytest.approx(0.1, abs=0.01)
     assert "constant speed" in stored["lag"]["caveat"]
@@ -285,7 +290,7 @@ def test_the_report_is_json_and_a_picture(tmp_path, capsys, needs_open3d):
 
 @pytest.mark.parametrize(("stamped", "recorded", "moved"), [(0.2, 0.0, -0.2), (0.2, 0.2, -0.2), (0.01, 0.0, 0.0)])
 def test_observations_are_moved_by_a_lag_that_is_clear_only(stamped, recorded, moved):
-    recording = replace(episode(markers=markers(lag=stamped, **GRID)), clock_offset=-recorded)
+    recording = replace(make_episode(markers=make_markers(lag=stamped, **GRID)), clock_offset=-recorded)
     lag = inspect(recording).lag
     assert lag.is_determined
     assert lag.differs_from_recorded == (stamped == 0.2 and recorded == 0.0)
@@ -293,7 +298,7 @@ def test_observations_are_moved_by_a_lag_that_is_clear_only(stamped, recorded, m
 
 
 def test_coverage_and_what_was_removed_are_explained(capsys, monkeypatch, needs_open3d):
-    recording = episode(points=clouds())
+    recording = make_episode(points=make_clouds())
     show(inspect(recording))
     text = " ".join(capsys.readouterr().out.split())
     assert "apart from the cloth" in text
@@ -304,7 +309,7 @@ def test_coverage_and_what_was_removed_are_explained(capsys, monkeypatch, needs_
 
 
 def test_an_unknown_arm_that_stands_by_takes_nothing_away():
-    recording = episode(markers=markers(lag=0.1, **GRID))
+    recording = make_episode(markers=make_markers(lag=0.1, **GRID))
     grasp = rec.GraspInfo(uv=np.array([[0.15, 0.3]]), radius=0.02)
     gripped = replace(recording, grasps={"hand": grasp})
     with_idle_arm = replace(gripped, joints={"spare": rec.JointMotion(np.arange(5) / 10, np.zeros((5, 6)))})

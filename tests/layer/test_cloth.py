@@ -5,7 +5,7 @@ import warnings
 
 import pytest
 import torch
-from helpers.small_sheet import sheet
+from helpers.small_sheet import make_sheet
 
 import torchcloth as tc
 from torchcloth.boundaries import sample_trajectory
@@ -30,7 +30,7 @@ def turning(end, angle, knots):
 
 @pytest.fixture
 def gripped():
-    return sheet(boundaries={"hand": tc.boundaries.Grasp([0, 1]), "table": tc.boundaries.Plane()})
+    return make_sheet(boundaries={"hand": tc.boundaries.Grasp([0, 1]), "table": tc.boundaries.Plane()})
 
 
 # -- refusals ---------------------------------------------------------------------------------------------------------
@@ -76,14 +76,14 @@ def test_accepts_turns_of_90_degrees_in_steps(gripped):
 
 @pytest.mark.parametrize("times", [[0.0], [0.0, 0.0], [0.1, 0.0], [0.0, math.nan], [], torch.tensor([0.0, 2.0, 1.0])])
 def test_refuses_times(times):
-    cloth = sheet()
+    cloth = make_sheet()
     with pytest.raises(InvalidInput, match=r"times; got .* increasing"):
         cloth(cloth.rest_state(), times=times)
 
 
 def test_refuses_times_that_want_gradients():
     """They would stay without, and nobody would be told."""
-    cloth, times = sheet(), torch.tensor([0.0, 0.01], requires_grad=True)
+    cloth, times = make_sheet(), torch.tensor([0.0, 0.01], requires_grad=True)
     with pytest.raises(InvalidInput, match=r"times; got .*gradients.*Trajectory\.t"):
         cloth(cloth.rest_state(), times=times)
     with torch.no_grad():
@@ -93,11 +93,11 @@ def test_refuses_times_that_want_gradients():
 @pytest.mark.parametrize("shape", [(15, 3), (16, 2), (16,), (2, 15, 3)])
 def test_refuses_positions_of_the_wrong_shape(shape):
     with pytest.raises(InvalidInput, match=r"x; got shape .*; expected \[\.\.\., 16, 3\]"):
-        sheet().state(torch.zeros(shape))
+        make_sheet().state(torch.zeros(shape))
 
 
 def test_refuses_a_step_that_is_too_large_and_names_the_one_that_works():
-    cloth = sheet()
+    cloth = make_sheet()
     limit = cloth.stable_step()
     with pytest.raises(UnstableStep, match=f"at most {limit:.4g} s") as refusal:
         cloth(cloth.rest_state(), times=[0.0, 0.1], dt=1.01 * limit)
@@ -110,7 +110,7 @@ def test_refuses_a_step_that_is_too_large_and_names_the_one_that_works():
 
 def test_refuses_a_simulation_without_end():
     """1e-12 s asked for 800 GB of times; a stiffness of 1e40 Pa for more substeps than an integer holds."""
-    cloth = sheet()
+    cloth = make_sheet()
     state = cloth.rest_state()
     with pytest.raises(InvalidInput, match=r"dt; got 1e-12 s, that is 1e\+11 substeps; expected at most 1e\+07"):
         cloth(state, times=[0.0, 0.1], dt=1e-12)
@@ -123,7 +123,7 @@ def test_refuses_a_simulation_without_end():
 
 def test_a_stiffness_changed_later_moves_the_limit():
     """A fit cannot cross it silently."""
-    cloth = sheet()
+    cloth = make_sheet()
     before = cloth.stable_step()
     cloth.material.youngs_modulus.set(4e5)
     assert cloth.stable_step() == pytest.approx(before / 2)
@@ -152,7 +152,7 @@ def test_a_stiffness_changed_later_moves_the_limit():
 )
 def test_refuses_boundaries(boundary, message):
     with pytest.raises(InvalidInput, match=message):
-        sheet(boundaries={"part": boundary()})
+        make_sheet(boundaries={"part": boundary()})
 
 
 @pytest.mark.parametrize(
@@ -188,7 +188,7 @@ def test_refuses_effects_and_contact(part, message):
 
 def test_divergence_names_the_vertex_and_the_time():
     """A velocity whose square overflows: the triangles around it lose their normals in the second substep."""
-    cloth = sheet()
+    cloth = make_sheet()
     state = cloth.rest_state()
     v = state.v.clone()
     v[6, 2] = 1e200
@@ -217,7 +217,7 @@ def test_divergence_names_the_vertex_and_the_time():
     ],
 )
 def test_refuses_states(engine, change, message):
-    cloth = sheet()
+    cloth = make_sheet()
     cloth.engine = engine
     with pytest.raises(InvalidInput, match=message):
         cloth(change(cloth.rest_state()), times=(0.0, 1e-3))
@@ -230,7 +230,7 @@ def test_refuses_a_batch_of_states_beside_another_of_fabrics():
 
 
 def test_velocities_alone_may_be_batched():
-    cloth = sheet()
+    cloth = make_sheet()
     state = cloth.rest_state()
     v = torch.stack([state.v, state.v + 0.1])
     both = cloth(state._replace(v=v), times=(0.0, 0.01)).x
@@ -245,7 +245,7 @@ def test_the_friction_of_a_table_alone_may_be_batched(engine):
     effects = {"gravity": tc.effects.Gravity((3.0, 0.0, -9.0))}
     coefficients, result = torch.tensor([[0.1], [0.5]]), []
     for mu in (coefficients, *coefficients.flatten().tolist()):
-        cloth = sheet(effects=effects, boundaries=table(mu))
+        cloth = make_sheet(effects=effects, boundaries=table(mu))
         cloth.engine = engine
         result.append(cloth(cloth.rest_state(), times=(0.0, 0.05)).x)
     assert float((result[1] - result[2]).detach().norm()) > 1e-3
@@ -255,20 +255,20 @@ def test_the_friction_of_a_table_alone_may_be_batched(engine):
 @pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16])
 def test_half_precision_is_refused(dtype):
     for contact in (None, tc.Contact()):
-        cloth = sheet(contact=contact).to(dtype)
+        cloth = make_sheet(contact=contact).to(dtype)
         with pytest.raises(InvalidInput, match=r"precision of the cloth; got .*float16; expected float32 or float64"):
             cloth(cloth.rest_state(), times=(0.0, 1e-3))
 
 
 @pytest.mark.parametrize("duration", [0.0, -1.0, math.nan])
 def test_refuses_to_settle_for_no_time(duration):
-    cloth = sheet()
+    cloth = make_sheet()
     with pytest.raises(InvalidInput, match=r"duration of settling; got .* s; expected a time > 0"):
         cloth.settle(cloth.rest_state(), duration=duration)
 
 
 def test_a_state_with_nan_is_refused():
-    cloth = sheet()
+    cloth = make_sheet()
     state = cloth.rest_state()
     x = state.x.clone()
     x[3, 0] = math.nan
@@ -279,7 +279,7 @@ def test_a_state_with_nan_is_refused():
 
 
 def test_a_runaway_extent_is_refused():
-    cloth = sheet(contact=tc.Contact())
+    cloth = make_sheet(contact=tc.Contact())
     with pytest.raises(SimulationDiverged, match="extent"):
         cloth(cloth.state(5 * cloth.rest_state().x), times=[0.0, 0.01])
 
@@ -295,7 +295,7 @@ def shaken(cloth, seed=0):
 
 @pytest.mark.parametrize("contact", [None, tc.Contact()], ids=["membrane", "contact"])
 def test_the_stable_step_is_stable(contact):
-    cloth = sheet(contact=contact)
+    cloth = make_sheet(contact=contact)
     state = shaken(cloth)
     with torch.no_grad():
         out = cloth(state, times=[0.0, 600 * cloth.stable_step()])
@@ -307,7 +307,7 @@ def test_beyond_the_limit_a_membrane_blows_up():
     """The bound is no more than 1.6 times too careful on this mesh: 2 / omega x 1.6 diverges."""
     from torchcloth.dynamics.stability import STABLE_STEP_OVER_LINEAR_LIMIT
 
-    cloth = sheet()
+    cloth = make_sheet()
     state, dt = shaken(cloth), 1.6 * cloth.stable_step() / STABLE_STEP_OVER_LINEAR_LIMIT
     with torch.no_grad():
         grown, _ = substep.rollout(cloth.build_model(), state, dt, {}, 100)
@@ -318,7 +318,7 @@ def test_beyond_the_limit_a_membrane_blows_up():
 def test_frames_are_met_and_an_interval_can_be_continued():
     """Substeps coincide, so that running on from a state is the run itself, up to rounding of the times."""
     effects, boundaries = {"gravity": tc.effects.Gravity()}, {"hand": tc.boundaries.Grasp([0, 1])}
-    cloth = sheet(effects=effects, boundaries=boundaries, contact=tc.Contact())
+    cloth = make_sheet(effects=effects, boundaries=boundaries, contact=tc.Contact())
     motion = {"hand": turning(1.0, 1.0, 5)}
     half = 24 * cloth.stable_step()
     dt = cloth.stable_step()
@@ -340,7 +340,7 @@ def test_frames_are_met_and_an_interval_can_be_continued():
 
 
 def test_held_vertices_follow_a_turning_pose_exactly():
-    cloth = sheet(boundaries={"hand": tc.boundaries.Grasp([0, 1, 5])}, effects={"gravity": tc.effects.Gravity()})
+    cloth = make_sheet(boundaries={"hand": tc.boundaries.Grasp([0, 1, 5])}, effects={"gravity": tc.effects.Gravity()})
     end = 500 * cloth.stable_step()
     motion = turning(end, 2.5, 9)
     with torch.no_grad():
@@ -352,7 +352,7 @@ def test_held_vertices_follow_a_turning_pose_exactly():
 
 
 def test_the_schedule_lets_go():
-    cloth = sheet(boundaries={"hand": tc.boundaries.Grasp(range(16))}, effects={"gravity": tc.effects.Gravity()})
+    cloth = make_sheet(boundaries={"hand": tc.boundaries.Grasp(range(16))}, effects={"gravity": tc.effects.Gravity()})
     motion = trajectory(0.2, 3)._replace(closed=torch.tensor([True, False, False]))
     with torch.no_grad():
         out = cloth(cloth.rest_state(), {"hand": motion}, times=[0.0, 0.1, 0.2])
@@ -364,7 +364,7 @@ def test_the_schedule_lets_go():
 
 
 def test_wrench_of_a_sheet_that_is_held_everywhere_is_its_weight():
-    cloth = sheet(boundaries={"hand": tc.boundaries.Grasp(range(16))}, effects={"gravity": tc.effects.Gravity()})
+    cloth = make_sheet(boundaries={"hand": tc.boundaries.Grasp(range(16))}, effects={"gravity": tc.effects.Gravity()})
     out = cloth(cloth.rest_state(), {"hand": trajectory()}, times=[0.0, 0.01])
     weight = 0.2 * 0.04 * 9.81
     expected = torch.tensor([0.0, 0.0, -weight, -weight * 0.1, weight * 0.1, 0.0])  # moment: r x (0, 0, -W)
@@ -374,7 +374,7 @@ def test_wrench_of_a_sheet_that_is_held_everywhere_is_its_weight():
 
 def test_wrench_of_a_hanging_sheet_at_rest_is_its_weight():
     effects = {"gravity": tc.effects.Gravity((0.0, -9.81, 0.0)), "damping": tc.effects.MassDamping(60.0)}
-    cloth = sheet(boundaries={"hand": tc.boundaries.Grasp([3, 7, 11, 15])}, effects=effects)
+    cloth = make_sheet(boundaries={"hand": tc.boundaries.Grasp([3, 7, 11, 15])}, effects=effects)
     with torch.no_grad():
         out = cloth(cloth.rest_state(), {"hand": trajectory()}, times=[0.0, 0.7, 0.8])
     weight = torch.tensor([0.0, -0.2 * 0.04 * 9.81, 0.0])
@@ -383,7 +383,7 @@ def test_wrench_of_a_hanging_sheet_at_rest_is_its_weight():
 
 def test_settling_brings_noise_to_rest():
     effects = {"gravity": tc.effects.Gravity((0.0, -9.81, 0.0))}
-    cloth = sheet(boundaries={"hand": tc.boundaries.Grasp([3, 7, 11, 15])}, effects=effects)
+    cloth = make_sheet(boundaries={"hand": tc.boundaries.Grasp([3, 7, 11, 15])}, effects=effects)
     torch.manual_seed(0)
     noisy = cloth.state(cloth.rest_state().x + 1e-3 * torch.randn(16, 3))
     motion = {"hand": turning(1.0, 1.0, 3)}
@@ -399,7 +399,7 @@ def test_an_effect_of_any_name_acts_while_the_cloth_settles():
     sags = []
     for name in ("gravity", "settling"):
         hold = {"hand": tc.boundaries.Grasp([3, 7, 11, 15])}
-        cloth = sheet(boundaries=hold, effects={name: tc.effects.Gravity((0.0, 0.0, -9.81))})
+        cloth = make_sheet(boundaries=hold, effects={name: tc.effects.Gravity((0.0, 0.0, -9.81))})
         with torch.no_grad():
             sags.append(cloth.settle(cloth.rest_state(), {"hand": trajectory()}, duration=0.05).x)
     assert torch.equal(*sags)
@@ -430,7 +430,7 @@ def test_in_float32_still_bodies_stand_still_and_moving_ones_are_smooth(start):
 
 
 def test_the_motion_is_an_input_and_nothing_is_remembered():
-    cloth = sheet(boundaries={"hand": tc.boundaries.Grasp([0])}, contact=tc.Contact())
+    cloth = make_sheet(boundaries={"hand": tc.boundaries.Grasp([0])}, contact=tc.Contact())
 
     def still():
         with torch.no_grad():
@@ -440,7 +440,7 @@ def test_the_motion_is_an_input_and_nothing_is_remembered():
     with torch.no_grad():
         cloth(cloth.rest_state(), {"hand": turning(1.0, 1.0, 4)}, times=[0.0, 0.01])
     assert torch.equal(still(), first)
-    assert "contact: none" in repr(sheet())
+    assert "contact: none" in repr(make_sheet())
 
 
 @pytest.mark.parametrize("rate", [math.nan, math.inf, -1.0])
@@ -462,7 +462,7 @@ def test_trajectories_cover_the_times_also_far_from_zero(gripped):
 @pytest.mark.parametrize("engine", ["reference", "fused"])
 def test_a_cloth_may_be_made_and_run_in_inference_mode(engine):
     def run():
-        cloth = sheet(contact=tc.Contact(), boundaries={"table": tc.boundaries.Plane()})
+        cloth = make_sheet(contact=tc.Contact(), boundaries={"table": tc.boundaries.Plane()})
         cloth.engine = engine
         return cloth(cloth.rest_state(), {}, times=[0.0, 0.01])
 
@@ -490,7 +490,7 @@ def test_cloth_that_has_far_to_go_is_not_settled_and_told():
 @pytest.mark.parametrize("engine", ["fused", "reference"])
 def test_parts_that_were_put_in_a_places_are_looked_at_again(engine):
     """Of a field of another mesh the engine would read, and write, other memory."""
-    cloth = sheet(contact=tc.Contact())
+    cloth = make_sheet(contact=tc.Contact())
     cloth.engine = engine
     cloth.material.cone = tc.PhysicalParameter(torch.tensor([0.3, 0.6]), "-", "nonnegative")
     with pytest.raises(InvalidInput, match=r"material\.cone; got shape \(2,\); expected a scalar, \[18\]"):

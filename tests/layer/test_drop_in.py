@@ -4,7 +4,7 @@ import copy
 
 import pytest
 import torch
-from helpers.small_sheet import sheet
+from helpers.small_sheet import make_sheet
 from torch import nn
 from torch.func import functional_call
 
@@ -30,7 +30,7 @@ class Learned(AbstractEffect):
 
 
 def gripped(effects=None, engine="auto"):
-    cloth = sheet(effects=effects, boundaries={"hand": tc.boundaries.Grasp.corner("upper-left")})
+    cloth = make_sheet(effects=effects, boundaries={"hand": tc.boundaries.Grasp.corner("upper-left")})
     cloth.engine = engine
     t = torch.linspace(0.0, 0.04, 5)
     pose = torch.eye(4).repeat(5, 1, 1)
@@ -73,7 +73,7 @@ def test_a_state_is_the_callers():
 
 def test_a_checkpoint_carries_what_is_learned_and_no_scene():
     """A fit that is loaded into another experiment must not move its table, nor what is held."""
-    of = lambda n, z, corner: sheet(  # noqa: E731
+    of = lambda n, z, corner: make_sheet(  # noqa: E731
         n,
         effects={"sticky": tc.effects.Adhesion(point=(0.0, 0.0, z))},
         boundaries={
@@ -102,7 +102,7 @@ def test_modules_with_a_cloth_can_be_gone_through():
 @pytest.mark.parametrize("engine", ENGINES)
 def test_parts_that_come_later_are_bound_as_the_first_ones_are(engine):
     cloth, motion = gripped({"gravity": tc.effects.Gravity()}, engine)
-    late = sheet(effects={"gravity": tc.effects.Gravity()})
+    late = make_sheet(effects={"gravity": tc.effects.Gravity()})
     late.engine = engine
     late = late.double()
     late.boundaries["hand"] = tc.boundaries.Grasp.corner("upper-left")
@@ -115,7 +115,7 @@ def test_parts_that_come_later_are_bound_as_the_first_ones_are(engine):
     with pytest.raises(InvalidInput, match="effects: table; got Plane"):
         late.effects["table"] = tc.boundaries.Plane()
     with pytest.raises(InvalidInput, match="another cloth"):
-        sheet(5).boundaries["hand"] = late.boundaries["hand"]
+        make_sheet(5).boundaries["hand"] = late.boundaries["hand"]
 
 
 # -- gradients -------------------------------------------------------------------------------------------------------

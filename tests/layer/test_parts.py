@@ -5,7 +5,7 @@ import gc
 
 import pytest
 import torch
-from helpers.small_sheet import sheet
+from helpers.small_sheet import make_sheet
 from torch.func import functional_call
 
 import torchcloth as tc
@@ -34,12 +34,12 @@ from torchcloth.errors import InvalidInput
 )
 def test_parts_whose_numbers_do_not_fit_the_mesh_are_refused(parts, message):
     with pytest.raises(InvalidInput, match=message):
-        sheet(**parts(18, 16))
+        make_sheet(**parts(18, 16))
 
 
 def test_coefficients_never_reach_beyond_their_rows():
     """Wrong numbers that come later, in the engine: it would read other memory."""
-    cloth = sheet(effects={"damping": tc.effects.MassDamping(1.0)})
+    cloth = make_sheet(effects={"damping": tc.effects.MassDamping(1.0)})
     cloth.engine = "fused"
     for count in (7, 15, 17, 18):
         with pytest.raises(InvalidInput, match=rf"damping.rate; got shape \({count},\); expected a scalar or \[B, 1\]"):
@@ -50,7 +50,7 @@ def test_coefficients_never_reach_beyond_their_rows():
 
 def test_a_field_wants_an_effect_that_was_made_with_one():
     """Stencils of bending differ, and are built with the cloth."""
-    cloth = sheet(effects={"bending": tc.effects.Bending(1e-5)})
+    cloth = make_sheet(effects={"bending": tc.effects.Bending(1e-5)})
     field = {"effects.bending.stiffness.raw": torch.full((18,), 1e-5)}
     with pytest.raises(InvalidInput, match=r"18 values for an effect that was made with one.*Bending\(torch.full"):
         functional_call(cloth, field, (cloth.rest_state(), {}, (0.0, 0.01)))
@@ -58,24 +58,24 @@ def test_a_field_wants_an_effect_that_was_made_with_one():
 
 def test_a_part_of_another_cloth_is_not_bound_anew():
     bending, hand = tc.effects.Bending(1e-3), tc.boundaries.Grasp.corner("upper-right", radius=1e-3)
-    first = sheet(effects={"bending": bending}, boundaries={"hand": hand})
+    first = make_sheet(effects={"bending": bending}, boundaries={"hand": hand})
     gripped = hand.index.clone()
     for parts in ({"effects": {"bending": bending}}, {"boundaries": {"hand": hand}}):
         with pytest.raises(InvalidInput, match=r"an effect or boundary of another cloth.*copy.deepcopy"):
-            sheet(7, **parts)
+            make_sheet(7, **parts)
     assert torch.equal(first.boundaries["hand"].index, gripped)
-    sheet(4, effects={"bending": bending})  # the same mesh
-    sheet(7, effects={"bending": copy.deepcopy(bending)})
+    make_sheet(4, effects={"bending": bending})  # the same mesh
+    make_sheet(7, effects={"bending": copy.deepcopy(bending)})
     del first
     gc.collect()
-    sheet(7, boundaries={"hand": hand})  # nobody's any more
+    make_sheet(7, boundaries={"hand": hand})  # nobody's any more
 
 
 def test_a_cloth_has_one_precision():
     torch.set_default_dtype(torch.float32)
     wide = torch.full((18,), 1e5, dtype=torch.float64)
     cloth = tc.Cloth(
-        sheet().mesh, tc.materials.AEP(wide, 0.3), 0.2, {"air": tc.effects.AirDrag(wide / 1e5)}, contact=None
+        make_sheet().mesh, tc.materials.AEP(wide, 0.3), 0.2, {"air": tc.effects.AirDrag(wide / 1e5)}, contact=None
     )
     for cloth.engine in ("reference", "fused"):
         assert cloth(cloth.rest_state(), times=(0.0, 1e-3)).x.dtype == torch.float32
@@ -84,7 +84,7 @@ def test_a_cloth_has_one_precision():
 def test_a_law_on_two_solids_survives_sensitivities():
     rubber = tc.boundaries.Coulomb(0.3)
     solids = {"table": tc.boundaries.Plane(friction=rubber), "ball": tc.boundaries.Sphere(0.1, friction=rubber)}
-    cloth = sheet(effects={"gravity": tc.effects.Gravity()}, boundaries=solids)
+    cloth = make_sheet(effects={"gravity": tc.effects.Gravity()}, boundaries=solids)
     along = tc.Directions({"boundaries.table.friction.raw": torch.tensor([1.0, 2.0])})
     cloth.sensitivities(cloth.rest_state(), {}, (0.0, 0.01), along=along)
     assert isinstance(rubber.raw, torch.nn.Parameter)
@@ -94,7 +94,7 @@ def test_a_law_on_two_solids_survives_sensitivities():
 def test_gradients_of_a_bodys_numbers_under_functional_call():
     """By recomputation, after ``functional_call`` has put the module's own back."""
     ball = tc.boundaries.Sphere(0.5, (0.1, 0.1, -0.5005), friction=0.3)
-    cloth = sheet(7, effects={"gravity": tc.effects.Gravity()}, boundaries={"ball": ball}, Y=1.0)
+    cloth = make_sheet(7, effects={"gravity": tc.effects.Gravity()}, boundaries={"ball": ball}, Y=1.0)
     cloth.engine = "reference"
     state = cloth.state(cloth.rest_state().x, torch.tensor([0.3, 0.1, -0.1]).expand(49, 3))
     raw, slopes = torch.tensor(0.02, requires_grad=True), []
@@ -124,7 +124,9 @@ class Pull(tc.effects.AbstractEffect):
 def test_gradients_are_those_of_the_values_that_were_simulated(engine):
     """A sweep, and one backward pass at its end: what is computed again must not take the last values for the first."""
     ball = tc.boundaries.Sphere(0.5, (0.1, 0.1, -0.5005), friction=0.3)
-    cloth = sheet(7, effects={"damping": tc.effects.MassDamping(0.5), "pull": Pull()}, boundaries={"ball": ball}, Y=1.0)
+    cloth = make_sheet(
+        7, effects={"damping": tc.effects.MassDamping(0.5), "pull": Pull()}, boundaries={"ball": ball}, Y=1.0
+    )
     cloth.engine = engine
     raw = [n.raw for n in (cloth.effects["pull"].strength, cloth.effects["damping"].rate, ball.friction, ball.radius)]
     state = cloth.state(cloth.rest_state().x, torch.tensor([0.3, 0.1, -0.1]).expand(49, 3))
@@ -146,7 +148,7 @@ def test_gradients_are_those_of_the_values_that_were_simulated(engine):
 
 def test_a_body_that_is_held_elsewhere_later_is_computed_again_where_it_was():
     hand = tc.boundaries.Grasp([0])
-    cloth = sheet(boundaries={"hand": hand})
+    cloth = make_sheet(boundaries={"hand": hand})
     cloth.engine = "reference"
     path = torch.eye(4).repeat(2, 1, 1)
     path[1, 2, 3] = 0.01
@@ -194,32 +196,32 @@ def test_axes_need_a_pattern(part):
     ],
 )
 def test_what_is_no_part_is_refused(what, given, got):
-    parts = {"mesh": sheet().mesh, "material": tc.materials.AEP(1e5, 0.3), "areal_density": 0.2}
+    parts = {"mesh": make_sheet().mesh, "material": tc.materials.AEP(1e5, 0.3), "areal_density": 0.2}
     with pytest.raises(InvalidInput, match=f"^{what}.*got {got}"):
         tc.Cloth(**(parts | {what: given}))
 
 
 def test_no_scenes_are_no_state():
     with pytest.raises(InvalidInput, match=r"^x; got shape \(0, 9, 3\)"):
-        sheet(3).state(torch.zeros(0, 9, 3))
+        make_sheet(3).state(torch.zeros(0, 9, 3))
 
 
 def test_a_copy_that_a_simulation_works_with_owns_nothing():
     hand = tc.boundaries.Grasp.corner("upper-right", radius=1e-3)
-    cloth = sheet(boundaries={"hand": hand})
+    cloth = make_sheet(boundaries={"hand": hand})
     shallow_clone_module(cloth)
     gc.collect()
     with pytest.raises(InvalidInput, match="an effect or boundary of another cloth"):
-        sheet(7, boundaries={"hand": hand})
+        make_sheet(7, boundaries={"hand": hand})
 
 
 def test_what_two_cloths_share_is_of_both():
     hand = tc.boundaries.Grasp.corner("upper-right", radius=1e-3)
-    first, second = (sheet(boundaries={"hand": hand}) for _ in range(2))
+    first, second = (make_sheet(boundaries={"hand": hand}) for _ in range(2))
     del second
     gc.collect()
     with pytest.raises(InvalidInput, match="an effect or boundary of another cloth"):
-        sheet(7, boundaries={"hand": hand})
+        make_sheet(7, boundaries={"hand": hand})
     assert first.boundaries["hand"] is hand
 
 
@@ -244,7 +246,7 @@ class Named(Pull):
 def test_scenes_differ_in_a_users_own_coefficients(kind):
     pull = kind()
     pull.strength = tc.PhysicalParameter([[0.05], [0.1]], "N", "nonnegative", name="pull")
-    cloth = sheet(effects={"pull": pull})
+    cloth = make_sheet(effects={"pull": pull})
     v = torch.tensor([0.3, 0.1, -0.1]).expand(16, 3)
     result = cloth(cloth.state(cloth.rest_state().x, v), times=(0.0, 0.01)).x
     assert result.shape == (2, 2, 16, 3)
@@ -253,7 +255,7 @@ def test_scenes_differ_in_a_users_own_coefficients(kind):
 
 def test_contact_is_kept_as_it_was_made():
     """What simulates is its grid: another value would be believed by fits alone."""
-    cloth = sheet(contact=tc.Contact())
+    cloth = make_sheet(contact=tc.Contact())
     with pytest.raises(AttributeError):
         cloth.contact = None
     assert cloth.contact == tc.Contact()
@@ -262,13 +264,13 @@ def test_contact_is_kept_as_it_was_made():
 @pytest.mark.parametrize(
     ("make", "said"),
     [
-        (lambda: sheet().state(None), r"x; got None; expected a tensor or an array"),
-        (lambda: sheet().state([[1.0], [1.0, 2.0]]), r"x; got .*; expected a tensor or an array"),
-        (lambda: sheet()(sheet().rest_state(), {1: 0, "hand": 0}), r"motion; got trajectories for"),
+        (lambda: make_sheet().state(None), r"x; got None; expected a tensor or an array"),
+        (lambda: make_sheet().state([[1.0], [1.0, 2.0]]), r"x; got .*; expected a tensor or an array"),
+        (lambda: make_sheet()(make_sheet().rest_state(), {1: 0, "hand": 0}), r"motion; got trajectories for"),
         (lambda: tc.boundaries.Sphere(torch.ones(2)), r"radius; got shape \(2,\); expected a scalar or \[B, 1\]"),
         (lambda: tc.boundaries.Box((1.0, 1.0, 1.0), pose="x"), r"pose; got"),
         (lambda: tc.materials.AEP(1e5, thickness=torch.full((18,), 1e-3)), r"thickness; got"),
-        (lambda: sheet(contact=tc.Contact(subdivisions=float("nan"))), r"contact subdivisions; got nan"),
+        (lambda: make_sheet(contact=tc.Contact(subdivisions=float("nan"))), r"contact subdivisions; got nan"),
         (lambda: tc.effects.ResidualForce(["drag"]), r"terms; got \['drag'\]; expected a dict"),
     ],
 )

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 import torch.autograd.forward_ad as forward_ad
-from helpers.bent_shapes import irregular, moment
+from helpers.bent_shapes import make_effect_inputs, make_irregular_mesh
 
 import torchcloth as tc
 from torchcloth.types import EffectInputs
@@ -54,7 +54,7 @@ def test_energy_of_a_cylinder_in_any_direction(n, tolerance, degrees):
     expected = 0.5 * 2e-5 / 0.2**2 * 0.09
     mesh = tc.meshes.rectangle(0.3, 0.3, resolution=(n, n))
     assert energy(mesh, cylinder(mesh.uv, degrees)) == pytest.approx(expected, rel=tolerance)
-    mesh = irregular(n)
+    mesh = make_irregular_mesh(n)
     assert energy(mesh, cylinder(mesh.uv, degrees)) == pytest.approx(expected, rel=tolerance)
 
 
@@ -62,7 +62,7 @@ def test_energy_of_a_cylinder_in_any_direction(n, tolerance, degrees):
 @pytest.mark.parametrize("poisson", [0.0, 0.3])
 def test_energy_of_constant_curvatures_is_exact(poisson, degrees):
     """Paraboloid z = (k1 u^2 + k2 v^2) / 2 on a stretched, irregular mesh: saddle, cup, anything."""
-    mesh = irregular(9)
+    mesh = make_irregular_mesh(9)
     a = math.radians(degrees)
     u, v = torch.as_tensor(mesh.uv).T
     for k1, k2 in ((3.0, -3.0), (3.0, 3.0), (2.0, 5.0)):
@@ -73,7 +73,7 @@ def test_energy_of_constant_curvatures_is_exact(poisson, degrees):
 
 
 def test_meshes_without_pattern_coordinates_are_unfolded():
-    flat = irregular(9)
+    flat = make_irregular_mesh(9)
     rotation = np.linalg.qr(np.random.default_rng(0).standard_normal((3, 3)))[0]
     askew = tc.meshes.Mesh.build(flat.vertices @ rotation.T, flat.faces)
     x = cylinder(flat.uv, 30)
@@ -112,7 +112,9 @@ def test_coarse_and_narrow_meshes(resolution):
 # -- null space, and stiffness of what oscillates -------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("make", [lambda: tc.meshes.rectangle(0.3, 0.3, resolution=(9, 9)), lambda: irregular(9)])
+@pytest.mark.parametrize(
+    "make", [lambda: tc.meshes.rectangle(0.3, 0.3, resolution=(9, 9)), lambda: make_irregular_mesh(9)]
+)
 def test_only_affine_deformation_is_free(make):
     mesh = make()
     bending = tc.effects.Bending(1.0).bind(mesh)
@@ -192,10 +194,10 @@ def test_cantilevers_of_woven_cloth(degrees, twist):
 
 @pytest.mark.parametrize("poisson", [0.0, 0.3])
 def test_equal_ratios_are_isotropic(poisson):
-    mesh = irregular(7)
+    mesh = make_irregular_mesh(7)
     x = torch.as_tensor(mesh.vertices) + 0.02 * torch.randn(49, 3, generator=torch.Generator().manual_seed(0))
     plain = tc.effects.Bending(2e-5, poisson=poisson).bind(mesh)
-    now = moment(mesh, x)
+    now = make_effect_inputs(mesh, x)
     for other in ({"weft_ratio": 1.0, "twist_ratio": 1.0}, {"stiffness": torch.full((72,), 2e-5)}):
         woven = tc.effects.Bending(**{"stiffness": 2e-5, "poisson": poisson, **other}).bind(mesh)
         force, expected = (e.force(e.coefficients(), now) for e in (woven, plain))
@@ -215,7 +217,7 @@ def test_a_stiff_end_bends_less():
 
 
 def test_force_is_minus_the_gradient_of_the_energy():
-    mesh = irregular(6)
+    mesh = make_irregular_mesh(6)
     bending = tc.effects.Bending(2e-5, damping_time=0.01, poisson=0.2).bind(mesh)
     torch.manual_seed(0)
     x = (torch.as_tensor(mesh.vertices) + 0.02 * torch.randn(2, 36, 3)).requires_grad_()
@@ -228,7 +230,7 @@ def test_force_is_minus_the_gradient_of_the_energy():
 
 
 def test_force_has_no_resultant():
-    mesh = irregular(6)
+    mesh = make_irregular_mesh(6)
     bending = tc.effects.Bending(2e-5).bind(mesh)
     x = torch.as_tensor(mesh.vertices) + 0.02 * torch.randn(36, 3) + 5.0
     force = bending.force(bending.coefficients(), EffectInputs(x, x, None, None))
@@ -238,7 +240,7 @@ def test_force_has_no_resultant():
 
 
 def test_rigid_motion_and_affine_stretch_cost_nothing():
-    mesh = irregular(9)
+    mesh = make_irregular_mesh(9)
     bending = tc.effects.Bending(2e-5).bind(mesh)
     triangle = tc.meshes.Mesh.build(np.eye(3), [[0, 1, 2]])
     assert energy(triangle, torch.randn(3, 3)) == 0.0
@@ -261,7 +263,7 @@ def test_float32_far_from_the_origin():
 
 
 def test_derivatives_in_both_modes_and_in_batches():
-    mesh = irregular(5)
+    mesh = make_irregular_mesh(5)
     bending = tc.effects.Bending(torch.tensor([[1e-5], [3e-5]]), damping_time=0.01).bind(mesh)
     x = torch.as_tensor(mesh.vertices) + 0.02 * torch.randn(2, 25, 3)
     v, tangent = torch.randn(2, 2, 25, 3)
@@ -299,7 +301,7 @@ def test_derivatives_in_both_modes_and_in_batches():
 )
 def test_refusals(options):
     with pytest.raises(tc.errors.InvalidInput, match="|".join(options)):
-        tc.effects.Bending(**options).bind(irregular(4))
+        tc.effects.Bending(**options).bind(make_irregular_mesh(4))
 
 
 # -- motion ---------------------------------------------------------------------------------------------------------
@@ -320,7 +322,7 @@ def test_amplitude_zero_is_bitwise_neutral():
 @pytest.mark.parametrize("damping_time", [None, 2e-3])
 def test_stable_step_is_obeyed(damping_time):
     """Soft membrane, stiff bending: the step is set by bending."""
-    mesh = irregular(13, size=0.06)
+    mesh = make_irregular_mesh(13, size=0.06)
     cloth = tc.Cloth(
         mesh, tc.materials.AEP(1e4), 0.2, {"bending": tc.effects.Bending(1e-3, damping_time)}, contact=None
     )
@@ -333,7 +335,9 @@ def test_stable_step_is_obeyed(damping_time):
     assert (energies["kinetic"] + energies["membrane"] < 1.5 * start).all()
 
 
-@pytest.mark.parametrize("make", [lambda: tc.meshes.rectangle(0.3, 0.2, resolution=(13, 9)), lambda: irregular(13)])
+@pytest.mark.parametrize(
+    "make", [lambda: tc.meshes.rectangle(0.3, 0.2, resolution=(13, 9)), lambda: make_irregular_mesh(13)]
+)
 def test_bound_on_the_frequency(make):
     mesh = make()
     bending = tc.effects.Bending(1e-3, damping_time=2e-3).bind(mesh)

@@ -2,7 +2,7 @@
 
 import pytest
 import torch
-from helpers.collider_scenes import lowered, sheet, slide
+from helpers.collider_scenes import make_sheet, simulate_sliding, translate_along_z
 
 import torchcloth as tc
 from torchcloth.boundaries import (
@@ -15,7 +15,7 @@ from torchcloth.boundaries.points import TrianglePoints
 
 def test_points_on_triangles_do_not_make_a_landing_bounce():
     """Impulses of many points per vertex: of the energy at 1 m/s less than a hundredth comes back (0.1 % measured)."""
-    cloth = sheet({"block": Box((1.0, 1.0, 0.2), lowered(-0.1), sampling=0.01)}, n=6)
+    cloth = make_sheet({"block": Box((1.0, 1.0, 0.2), translate_along_z(-0.1), sampling=0.01)}, n=6)
     x = cloth.rest_state().x + torch.tensor([-0.05, -0.05, 0.002])
     with torch.no_grad():
         out = cloth(cloth.state(x, torch.tensor([0.0, 0.0, -1.0]).expand_as(x)), times=torch.linspace(0, 0.03, 16))
@@ -29,7 +29,7 @@ def test_points_on_triangles_do_not_make_a_landing_bounce():
     [
         (lambda **o: Sphere(0.08, (0, 0, -0.08), **o), 1.0, 0.2),
         (lambda **o: Capsule((-0.1, 0, -0.02), (0.1, 0, -0.02), 0.02, **o), 2.5, 0.5),
-        (lambda **o: Box((0.1, 0.1, 0.1), lowered(-0.05), **o), 4.0, 2.0),
+        (lambda **o: Box((0.1, 0.1, 0.1), translate_along_z(-0.05), **o), 4.0, 2.0),
     ],
     ids=["sphere", "capsule", "box"],
 )
@@ -40,7 +40,7 @@ def test_points_on_triangles_keep_small_bodies_out(body, vertices_alone, sampled
     for sampling in (None, 0.005):
         solid = body(sampling=sampling, friction=0.3)
         damping = {"air": tc.effects.AirDrag(1.2)}
-        cloth = sheet({"body": solid}, size=0.2, n=11, effects=damping, E=5e4)
+        cloth = make_sheet({"body": solid}, size=0.2, n=11, effects=damping, E=5e4)
         x = cloth.rest_state().x - torch.tensor([0.103, 0.102, -0.002])
         with torch.no_grad():
             out = cloth(cloth.state(x), times=torch.linspace(0, 0.25, 6))
@@ -50,7 +50,9 @@ def test_points_on_triangles_keep_small_bodies_out(body, vertices_alone, sampled
 
 
 def test_an_offset_is_a_thicker_body():
-    thick, large = (slide(Sphere(r, (0, 0, -0.3), friction=0.3, offset=o), 0.4) for r, o in ((0.29, 0.01), (0.3, 0.0)))
+    thick, large = (
+        simulate_sliding(Sphere(r, (0, 0, -0.3), friction=0.3, offset=o), 0.4) for r, o in ((0.29, 0.01), (0.3, 0.0))
+    )
     torch.testing.assert_close(thick, large, rtol=0, atol=1e-8)
 
 
@@ -83,7 +85,7 @@ def test_points_share_impulses_without_losing_momentum():
 def test_a_heavy_hem_at_rest_is_not_thrown_up(engine, hem):
     """Cloth beside it lands: what is stopped there takes the hem along by its mass, not as if it were light cloth."""
     table, effects = tc.boundaries.Plane(friction=0.0, sampling=0.003), {"hem": tc.effects.LineMass(hem)}
-    cloth = sheet({"table": table}, None, n=11, effects=effects, E=1.0, density=0.1)
+    cloth = make_sheet({"table": table}, None, n=11, effects=effects, E=1.0, density=0.1)
     cloth.engine = engine
     x = cloth.rest_state().x
     inwards = torch.minimum(x[:, :2], 0.1 - x[:, :2]).amin(-1)

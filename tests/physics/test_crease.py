@@ -4,7 +4,14 @@ import math
 
 import pytest
 import torch
-from helpers.bent_shapes import cylinder, drift, irregular, moment, relative, through
+from helpers.bent_shapes import (
+    make_effect_inputs,
+    make_gradient_problem,
+    make_irregular_mesh,
+    measure_momentum_drift,
+    roll_to_cylinder,
+    trace_memory,
+)
 
 import torchcloth as tc
 from torchcloth.testing import check_gradients
@@ -20,11 +27,11 @@ def sheet(mesh, **options):
 @pytest.mark.parametrize("steps", [1, 7])
 def test_crease_of_a_sheet_held_bent(steps, degrees):
     """k0 = (k - k_y) (1 - exp(-mobility t)), of the curvature that each vertex sees, however the time is cut."""
-    mesh = irregular(17)
+    mesh = make_irregular_mesh(17)
     effect = sheet(mesh)
-    x = cylinder(mesh, 12.0, degrees)
+    x = roll_to_cylinder(mesh, 12.0, degrees)
     time = 0.04
-    crease = through(effect, mesh, [torch.as_tensor(mesh.vertices), *[x] * steps], dt=time / steps)[-1]
+    crease = trace_memory(effect, mesh, [torch.as_tensor(mesh.vertices), *[x] * steps], dt=time / steps)[-1]
     seen = effect.stencil.fit_surface(x).curvature
     size = seen.norm(dim=-1, keepdim=True)
     expected = (size - YIELD) * (1 - math.exp(-MOBILITY * time)) * seen / size
@@ -33,8 +40,8 @@ def test_crease_of_a_sheet_held_bent(steps, degrees):
 
 
 def test_below_the_yield_curvature_nothing_stays():
-    mesh = irregular(9)
-    memories = through(sheet(mesh), mesh, [cylinder(mesh, k) for k in torch.linspace(0, 4.8, 9)], dt=10.0)
+    mesh = make_irregular_mesh(9)
+    memories = trace_memory(sheet(mesh), mesh, [roll_to_cylinder(mesh, k) for k in torch.linspace(0, 4.8, 9)], dt=10.0)
     assert all(torch.equal(memory, torch.zeros_like(memory)) for memory in memories)
 
 
@@ -53,7 +60,7 @@ def test_a_strip_that_was_folded_and_let_go_keeps_its_angle(curl):
     t = torch.tensor([0.0, hold, 9.0])
     motion = {"hands": tc.Trajectory(t, torch.eye(4).repeat(3, 1, 1), torch.tensor([True, False, False]))}
     with torch.no_grad():
-        out = cloth(cloth.state(cylinder(mesh, bent)), motion, times=(0.0, hold, 0.5))
+        out = cloth(cloth.state(roll_to_cylinder(mesh, bent)), motion, times=(0.0, hold, 0.5))
     crease = (bent - curl - YIELD) * (1 - math.exp(-mobility * hold))
     line = out.x[-1].unflatten(0, (columns, -1)).mean(1)
     step = line[1:] - line[:-1]
@@ -64,18 +71,18 @@ def test_a_strip_that_was_folded_and_let_go_keeps_its_angle(curl):
 
 
 def test_force_is_that_of_the_energy_from_the_creased_shape():
-    mesh = irregular(6)
+    mesh = make_irregular_mesh(6)
     effect = sheet(mesh, weft_ratio=0.5, curl_warp=1.0)
     c = effect.coefficients()
     crease = torch.randn(36, 3, generator=torch.Generator().manual_seed(0))
     x = torch.as_tensor(mesh.vertices) + 0.01 * torch.randn(36, 3, generator=torch.Generator().manual_seed(1))
     x.requires_grad_()
     (gradient,) = torch.autograd.grad(effect.energy(c, x, crease), x)
-    torch.testing.assert_close(effect.force(c, moment(mesh, x, crease)), -gradient, rtol=1e-9, atol=1e-13)
+    torch.testing.assert_close(effect.force(c, make_effect_inputs(mesh, x, crease)), -gradient, rtol=1e-9, atol=1e-13)
 
 
 def test_momentum_and_angular_momentum_are_kept():
-    linear, angular = drift({"bending": tc.effects.CreasingBending(1e-3, 100.0, 0.5)})
+    linear, angular = measure_momentum_drift({"bending": tc.effects.CreasingBending(1e-3, 100.0, 0.5)})
     assert linear < 1e-9
     assert angular < 1e-9
 
@@ -85,11 +92,13 @@ def test_gradients_through_the_crease():
     mesh = tc.meshes.rectangle(0.08, 0.04, resolution=(5, 3))
     effects = {"bending": tc.effects.CreasingBending(1e-3, 50.0, 1.0, curl_warp=1.0)}
     cloth = tc.Cloth(mesh, tc.materials.AEP(200.0, 0.2), 0.2, effects, contact=None)
-    state = cloth.state(cylinder(mesh, 8.0, 20))
+    state = cloth.state(roll_to_cylinder(mesh, 8.0, 20))
     times = (0.0, 14 * cloth.stable_step())
     with torch.no_grad():
         assert cloth(state, times=times).state.memory["effects.bending"].norm(dim=-1).max() > 0.05
-    check_gradients(*relative(cloth, state, times, ("mobility", "stiffness", "curl_warp"), "bending"), 1e-6, acts=True)
+    check_gradients(
+        *make_gradient_problem(cloth, state, times, ("mobility", "stiffness", "curl_warp"), "bending"), 1e-6, acts=True
+    )
 
 
 @pytest.mark.parametrize("options", [{"mobility": -1.0}, {"yield_curvature": 0.0}, {"poisson": 1.0}])

@@ -4,7 +4,7 @@ import sys
 
 import pytest
 import torch
-from helpers.collider_scenes import block
+from helpers.collider_scenes import make_box_mesh
 
 import torchcloth as tc
 from torchcloth.boundaries import (
@@ -23,8 +23,8 @@ from torchcloth.errors import InvalidInput, MissingDependency, SimulationDiverge
 
 def test_a_state_dict_leaves_a_solid_what_it_is():
     """Two grids of one shape: a solid and another of twice its size."""
-    small = MeshSolid(*block((0.1, 0.08, 0.06), (0, 0, 0)), cell=0.01)
-    large = MeshSolid(*block((0.2, 0.16, 0.12), (0, 0, 0)), cell=0.02)
+    small = MeshSolid(*make_box_mesh((0.1, 0.08, 0.06), (0, 0, 0)), cell=0.01)
+    large = MeshSolid(*make_box_mesh((0.2, 0.16, 0.12), (0, 0, 0)), cell=0.02)
     p = torch.tensor([[0.07, 0.01, 0.0], [0.0, 0.0, 0.02]])
     before = small.distance(p)[0]
     assert not torch.equal(before, large.distance(p)[0])
@@ -45,7 +45,7 @@ def test_a_mesh_solid_is_the_solid_that_its_mesh_draws(cell):
         assert float(torch.linalg.cross(normal, p / 0.06).norm(dim=-1).max()) < 1.0 * cell / 0.06
         size = (0.16, 0.12, 0.1)
         p = 0.18 * (torch.rand(20000, 3) - 0.5)
-        got, _ = MeshSolid(*block(size, (0, 0, 0)), cell=cell).distance(p)
+        got, _ = MeshSolid(*make_box_mesh(size, (0, 0, 0)), cell=cell).distance(p)
         exact, _ = Box(size).distance(p)
         error = (got - exact).abs()
         near = exact.abs() < 0.003
@@ -56,7 +56,7 @@ def test_a_mesh_solid_is_the_solid_that_its_mesh_draws(cell):
 
 @pytest.mark.parametrize("engine", ["reference", "auto"])
 def test_a_cloth_that_is_lost_beside_a_mesh_is_said_to_diverge(engine):
-    solid = MeshSolid(*block((0.1, 0.08, 0.06), (0, 0, 0)), cell=0.01)
+    solid = MeshSolid(*make_box_mesh((0.1, 0.08, 0.06), (0, 0, 0)), cell=0.01)
     cloth = tc.Cloth(tc.meshes.rectangle(0.1, 0.1, resolution=(4, 4)), tc.materials.AEP(1e4), 0.2, {}, {"body": solid})
     cloth.engine = engine
     x = cloth.rest_state().x
@@ -86,8 +86,8 @@ def test_a_cloth_that_is_lost_beside_a_mesh_is_said_to_diverge(engine):
         (lambda: Plane(sampling=0.0), "sampling"),
         (lambda: Plane(recovery=-1.0), "recovery"),
         (lambda: MeshSolid(*_open_block()), "solid mesh"),
-        (lambda: MeshSolid(*block((1, 1, 1), (0, 0, 0)), cell=0.0), "cell"),
-        (lambda: MeshSolid(*block((1, 1, 1), (0, 0, 0)), cell=1e-3), "grid nodes"),
+        (lambda: MeshSolid(*make_box_mesh((1, 1, 1), (0, 0, 0)), cell=0.0), "cell"),
+        (lambda: MeshSolid(*make_box_mesh((1, 1, 1), (0, 0, 0)), cell=1e-3), "grid nodes"),
     ],
 )
 def test_refuses_what_is_no_body(make, word):
@@ -98,9 +98,9 @@ def test_refuses_what_is_no_body(make, word):
 def test_a_mesh_solid_without_open3d_says_what_to_install(monkeypatch):
     monkeypatch.setitem(sys.modules, "open3d", None)
     with pytest.raises(MissingDependency, match="torchcloth\\[observe\\]"):
-        MeshSolid(*block((1, 1, 1), (0, 0, 0)))
+        MeshSolid(*make_box_mesh((1, 1, 1), (0, 0, 0)))
 
 
 def _open_block():
-    vertices, faces = block((1, 1, 1), (0, 0, 0))
+    vertices, faces = make_box_mesh((1, 1, 1), (0, 0, 0))
     return vertices, faces[1:]

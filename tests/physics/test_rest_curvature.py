@@ -4,7 +4,7 @@ import math
 
 import pytest
 import torch
-from helpers.bent_shapes import cylinder, drift, irregular, moment
+from helpers.bent_shapes import make_effect_inputs, make_irregular_mesh, measure_momentum_drift, roll_to_cylinder
 
 import torchcloth as tc
 from torchcloth.testing import check_gradients
@@ -67,9 +67,9 @@ def test_the_rest_shape_is_free_of_force(degrees):
     name = "curl_weft" if degrees else "curl_warp"
     bending = tc.effects.Bending(1e-3, **{name: 4.0}).bind(mesh)
     c = bending.coefficients()
-    x, flat = cylinder(mesh, 4.0, degrees), torch.as_tensor(mesh.vertices)
+    x, flat = roll_to_cylinder(mesh, 4.0, degrees), torch.as_tensor(mesh.vertices)
     assert bending.energy(c, x).item() < 1e-4 * bending.energy(c, flat).item()
-    rest, loaded = (bending.force(c, moment(mesh, y)).norm().item() for y in (x, flat))
+    rest, loaded = (bending.force(c, make_effect_inputs(mesh, y)).norm().item() for y in (x, flat))
     assert rest < 0.03 * loaded
 
 
@@ -83,19 +83,19 @@ OPTIONS = [
 
 @pytest.mark.parametrize("options", OPTIONS)
 def test_force_is_minus_the_gradient_of_the_energy(options):
-    mesh = irregular(6)
+    mesh = make_irregular_mesh(6)
     bending = tc.effects.Bending(**{"stiffness": 2e-5, **options}).bind(mesh)
     c = bending.coefficients()
     x = torch.as_tensor(mesh.vertices) + 0.02 * torch.randn(36, 3, generator=torch.Generator().manual_seed(0))
     check_gradients(lambda x: bending.energy(c, x), {"x": x}, 1e-7)
     x.requires_grad_()
     (gradient,) = torch.autograd.grad(bending.energy(c, x).sum(), x)
-    torch.testing.assert_close(bending.force(c, moment(mesh, x)), -gradient, rtol=1e-10, atol=1e-14)
+    torch.testing.assert_close(bending.force(c, make_effect_inputs(mesh, x)), -gradient, rtol=1e-10, atol=1e-14)
 
 
 @pytest.mark.parametrize("options", OPTIONS)
 def test_momentum_and_angular_momentum_are_kept(options):
-    linear, angular = drift({"bending": tc.effects.Bending(**{"stiffness": 1e-3, **options})})
+    linear, angular = measure_momentum_drift({"bending": tc.effects.Bending(**{"stiffness": 1e-3, **options})})
     assert linear < 1e-9
     assert angular < 1e-9
 

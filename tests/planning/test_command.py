@@ -6,7 +6,7 @@ import shutil
 import numpy as np
 import pytest
 import torch
-from helpers.planning_scenes import by_arm, by_hand, cloth_of
+from helpers.planning_scenes import build_nominal_cloth, make_arm_episode, make_hand_episode
 from helpers.schema_checks import check_written
 
 from torchcloth import recordings as rec
@@ -21,12 +21,12 @@ OPTIONS = ["--iterations", "3", "--wait", "0.1", "--waypoints", "2"]
 
 @pytest.fixture
 def folder(tmp_path):
-    return rec.write(by_arm(), tmp_path / "episode")
+    return rec.write(make_arm_episode(), tmp_path / "episode")
 
 
 def goal_in(place):
     """The cloth as it hangs at first, 3 cm in front."""
-    x = build_episode(cloth_of(by_arm()), by_arm(), 20.0).initial.numpy()
+    x = build_episode(build_nominal_cloth(make_arm_episode()), make_arm_episode(), 20.0).initial.numpy()
     np.save(place / "goal.npy", x + np.array([0.03, 0.0, 0.0]))
     return place / "goal.npy"
 
@@ -43,7 +43,7 @@ def planned(tmp_path_factory):
     before = torch.get_default_dtype()
     torch.set_default_dtype(torch.float64)
     try:
-        episode_of = rec.write(by_arm(), place / "episode")
+        episode_of = rec.write(make_arm_episode(), place / "episode")
         arguments = ["--goal", str(goal_in(place)), "--out", str(place / "out"), *OPTIONS]
         assert main(["plan", str(episode_of), *arguments]) == 0
     finally:
@@ -123,10 +123,10 @@ def test_wrong_input_is_one_line_and_leaves_nothing(folder, goal, tmp_path, caps
 
 
 def test_what_was_recorded_where_the_plan_would_go_stays(folder, goal, tmp_path, capsys):
-    custom = rec.write(by_hand(), tmp_path / "out" / "episode")
+    custom = rec.write(make_hand_episode(), tmp_path / "out" / "episode")
     assert main(["plan", str(folder), "--goal", str(goal), "--out", str(custom.parent), *OPTIONS]) == 2
     assert "no earlier plan" in capsys.readouterr().err
-    assert rec.read(custom).provenance == by_hand().provenance
+    assert rec.read(custom).provenance == make_hand_episode().provenance
 
 
 def test_what_was_filmed_where_the_plan_would_go_stays(folder, goal, planned, tmp_path, capsys):

@@ -160,19 +160,21 @@ def test_files_of_pieces(tmp_path):
 
 
 def test_markers_are_pieces_where_the_last_frame_has_them(tmp_path):
-    from helpers.planning_scenes import by_hand
+    from helpers.planning_scenes import make_hand_episode
 
     uv, xyz = np.array([[0.0, 0.0], [0.1, 0.1]]), np.zeros((3, 2, 3))
     xyz[-1] = [[np.nan] * 3, [0.1, 0.2, 0.3]]
     markers = rec.Markers(np.linspace(0, 0.2, 3), xyz, uv)
-    result = read_goal(rec.write(replace(by_hand(), markers=markers), tmp_path / "seen"), correspondences=True)
+    result = read_goal(
+        rec.write(replace(make_hand_episode(), markers=markers), tmp_path / "seen"), correspondences=True
+    )
     assert result.points.tolist() == [[0.1, 0.2, 0.3]]
     assert result.uv.tolist() == [[0.1, 0.1]]
-    unknown = rec.write(replace(by_hand(), markers=replace(markers, uv=None)), tmp_path / "unknown")
+    unknown = rec.write(replace(make_hand_episode(), markers=replace(markers, uv=None)), tmp_path / "unknown")
     with pytest.raises(InvalidInput, match="without pattern coordinates"):
         read_goal(unknown, correspondences=True)
     with pytest.raises(RecordingError, match="markers"):
-        read_goal(rec.write(by_hand(), tmp_path / "blind"), correspondences=True)
+        read_goal(rec.write(make_hand_episode(), tmp_path / "blind"), correspondences=True)
 
 
 def test_triangles_of_other_points_are_refused():
@@ -198,8 +200,8 @@ def test_files_that_show_no_cloth_are_refused_in_one_line(tmp_path, name):
 
 
 def test_an_episode_without_points_is_no_goal(tmp_path):
-    from helpers.planning_scenes import by_hand
+    from helpers.planning_scenes import make_hand_episode
 
-    rec.write(by_hand(), tmp_path / "blind")
+    rec.write(make_hand_episode(), tmp_path / "blind")
     with pytest.raises(RecordingError, match="points"):
         read_goal(tmp_path / "blind")

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from helpers.planning_scenes import LASTS, by_arm, by_hand, cloth_of, sheet_of
+from helpers.planning_scenes import DURATION_S, build_nominal_cloth, describe_cloth, make_arm_episode, make_hand_episode
 
 import torchcloth as tc
 from torchcloth import recordings as rec
@@ -28,7 +28,7 @@ AWAY = torch.tensor([0.04, 0.02, 0.03])
 
 
 def task_of(recording, goal, waypoints=2):
-    cloth = cloth_of(recording).requires_grad_(False)
+    cloth = build_nominal_cloth(recording).requires_grad_(False)
     courses = extract_motion_parameters(cloth, recording, waypoints, WAIT, DEFAULT_JOINT_ACCELERATION, GripperLimits())
     return PlanningTask([ForwardModel(exact_model(cloth), recording, courses, None)], courses, goal, None, None)
 
@@ -46,7 +46,7 @@ def shifted_goal(recording, way=AWAY):
     return Goal(x + way, faces)
 
 
-@pytest.mark.parametrize("scene", [by_hand, by_arm])
+@pytest.mark.parametrize("scene", [make_hand_episode, make_arm_episode])
 def test_slopes_are_derivatives_through_arm_and_cloth(scene):
     recording = scene()
     task = task_of(recording, shifted_goal(recording))
@@ -62,14 +62,14 @@ def test_slopes_are_derivatives_through_arm_and_cloth(scene):
 
 
 def test_the_cloth_ends_at_a_goal_that_another_mesh_and_another_motion_made():
-    recording, motion = by_hand(), by_hand()
+    recording, motion = make_hand_episode(), make_hand_episode()
     path = motion.grippers["hand"]
-    s = (path.t / LASTS)[:, None]
+    s = (path.t / DURATION_S)[:, None]
     other = replace(path, position=path.position + (10 * s**3 - 15 * s**4 + 6 * s**5) * AWAY.numpy())
     finer = tc.meshes.rectangle(0.2, 0.2, triangles=288)
     x = np.array([0.0, 0.0, 0.5]) + np.stack([0 * finer.uv[:, 0], finer.uv[:, 0], finer.uv[:, 1] - 0.2], axis=-1)
-    end, faces = end_of(replace(motion, cloth=sheet_of(x, finer), grippers={"hand": other}))
-    result = tc.plan(cloth_of(recording), recording, Goal(end, faces), **QUICK)
+    end, faces = end_of(replace(motion, cloth=describe_cloth(x, finer), grippers={"hand": other}))
+    result = tc.plan(build_nominal_cloth(recording), recording, Goal(end, faces), **QUICK)
     assert result.distance_before[0] > 0.015
     assert result.distance_after[0] < 2e-3 < 0.15 * result.distance_before[0]
     assert result.distance_history[0] == result.distance_before[0]
@@ -78,22 +78,22 @@ def test_the_cloth_ends_at_a_goal_that_another_mesh_and_another_motion_made():
 
 
 def test_each_piece_comes_to_where_it_shall_be():
-    recording = by_hand()
+    recording = make_hand_episode()
     x, faces = end_of(recording)
     path = recording.grippers["hand"]
-    s = (path.t / LASTS)[:, None]
+    s = (path.t / DURATION_S)[:, None]
     moved = replace(path, position=path.position + (10 * s**3 - 15 * s**4 + 6 * s**5) * AWAY.numpy())
     wanted, _ = end_of(replace(recording, grippers={"hand": moved}))
     goal = Goal(wanted, faces, vertices=torch.arange(len(x)))
-    result = tc.plan(cloth_of(recording), recording, goal, **QUICK)
+    result = tc.plan(build_nominal_cloth(recording), recording, goal, **QUICK)
     assert result.distance_before[0] == pytest.approx(float((x - wanted).norm(dim=1).mean()), rel=1e-6)
     assert result.distance_after[0] < 0.15 * result.distance_before[0]
     assert result.distance_after[0] == pytest.approx(float((result.frames[-1] - wanted).norm(dim=1).mean()), rel=1e-6)
 
 
 def test_the_planned_episode_does_what_was_expected(tmp_path):
-    recording = by_arm()
-    result = tc.plan(cloth_of(recording), recording, shifted_goal(recording), **QUICK)
+    recording = make_arm_episode()
+    result = tc.plan(build_nominal_cloth(recording), recording, shifted_goal(recording), **QUICK)
     assert result.distance_after[0] < 0.5 * result.distance_before[0]
     folder, _ = result.save(tmp_path)
     again = rec.read(folder)
@@ -105,20 +105,28 @@ def test_the_planned_episode_does_what_was_expected(tmp_path):
 
 
 def test_a_free_motion_beyond_what_a_hand_can_do_is_not_planned():
-    recording = by_hand()
+    recording = make_hand_episode()
     goal = shifted_goal(recording, 5 * AWAY)
-    slow = tc.plan(cloth_of(recording), recording, goal, limits=GripperLimits(speed=0.2, acceleration=2.0), **QUICK)
+    slow = tc.plan(
+        build_nominal_cloth(recording), recording, goal, limits=GripperLimits(speed=0.2, acceleration=2.0), **QUICK
+    )
     t, path = slow.motion["hand"].t, slow.motion["hand"].pose[:, :3, 3]
     assert slow.nearest_limit[0] == pytest.approx(1.0, abs=1e-3)
     assert float((path.diff(dim=0) / t.diff()[:, None]).abs().max()) < 0.205
-    fast = tc.plan(cloth_of(recording), recording, goal, **QUICK)
+    fast = tc.plan(build_nominal_cloth(recording), recording, goal, **QUICK)
     assert fast.distance_after[0] < 0.5 * slow.distance_after[0]
 
 
 def test_adam_descends_too():
-    recording = by_hand()
+    recording = make_hand_episode()
     result = tc.plan(
-        cloth_of(recording), recording, shifted_goal(recording), method="adam", iterations=25, rate=0.005, wait=WAIT
+        build_nominal_cloth(recording),
+        recording,
+        shifted_goal(recording),
+        method="adam",
+        iterations=25,
+        rate=0.005,
+        wait=WAIT,
     )
     assert result.distance_after[0] < 0.35 * result.distance_before[0]
     assert len(result.distance_history) == 26
@@ -126,7 +134,7 @@ def test_adam_descends_too():
 
 def test_a_robot_that_errs_is_corrected_for():
     """The arm's base is 2 cm elsewhere; what is seen is 1 cm elsewhere again."""
-    recording = by_hand()
+    recording = make_hand_episode()
     off, blind = torch.tensor([0.0, 0.02, 0.0]), torch.tensor([0.01, 0.0, 0.0])
 
     def driven(e):
@@ -137,7 +145,7 @@ def test_a_robot_that_errs_is_corrected_for():
             moved[name] = m._replace(pose=pose)
         return replace(e, motion=moved, initial=e.initial + off)
 
-    world = World(cloth_of(recording)).with_motion_transform(driven)
+    world = World(build_nominal_cloth(recording)).with_motion_transform(driven)
     world = world.with_observation_transform(lambda frames, e: frames._replace(x=frames.x + blind))
     x, faces = end_of(recording)
     result = tc.plan(WorldModel(world, (), torch.zeros(0)), recording, Goal(x, faces), **QUICK)
@@ -148,9 +156,9 @@ def test_a_robot_that_errs_is_corrected_for():
 
 
 def test_of_several_models_the_mean_is_descended():
-    recording = by_hand()
+    recording = make_hand_episode()
     goal = shifted_goal(recording)
-    light, heavy = cloth_of(recording), cloth_of(recording)
+    light, heavy = build_nominal_cloth(recording), build_nominal_cloth(recording)
     heavy.areal_density.set(0.9)
     both = tc.plan([light, heavy], recording, goal, **QUICK)
     assert len(both.distance_before) == len(both.distance_after) == 2
@@ -160,8 +168,8 @@ def test_of_several_models_the_mean_is_descended():
 
 
 def test_a_stopped_search_goes_on_and_ends_alike(tmp_path):
-    recording = by_hand()
-    cloth, goal = cloth_of(recording), shifted_goal(recording)
+    recording = make_hand_episode()
+    cloth, goal = build_nominal_cloth(recording), shifted_goal(recording)
     whole = tc.plan(cloth, recording, goal, **QUICK)
 
     def stop(number, distance, best):
@@ -195,8 +203,8 @@ def test_a_stopped_search_goes_on_and_ends_alike(tmp_path):
 
 
 def test_the_users_cloth_is_left_as_it_is():
-    recording = by_hand()
-    cloth = cloth_of(recording)
+    recording = make_hand_episode()
+    cloth = build_nominal_cloth(recording)
     tc.plan(cloth, recording, shifted_goal(recording), wait=WAIT, iterations=1)
     assert all(p.requires_grad and p.grad is None for p in cloth.parameters())
 
@@ -213,20 +221,20 @@ def test_the_users_cloth_is_left_as_it_is():
     ],
 )
 def test_options_that_give_no_search_are_refused(options, message):
-    recording = by_hand()
+    recording = make_hand_episode()
     with pytest.raises(InvalidInput, match=message):
-        tc.plan(cloth_of(recording), recording, Goal(torch.zeros(4, 3)), **options)
+        tc.plan(build_nominal_cloth(recording), recording, Goal(torch.zeros(4, 3)), **options)
 
 
 def test_a_goal_in_millimetres_is_refused():
-    recording = by_hand()
+    recording = make_hand_episode()
     goal = Goal(1e3 * end_of(recording)[0])
     with pytest.raises(InvalidInput, match=r"goal.*in metres"):
-        tc.plan(cloth_of(recording), recording, goal)
+        tc.plan(build_nominal_cloth(recording), recording, goal)
 
 
 def test_models_that_are_none_are_refused():
-    recording = by_hand()
+    recording = make_hand_episode()
     for model in ([], ["cloth"], None):
         with pytest.raises(InvalidInput, match=r"model.*a Cloth or a diagnosis.WorldModel"):
             tc.plan(model, recording, Goal(torch.zeros(4, 3)))  # type: ignore[arg-type]
@@ -234,7 +242,7 @@ def test_models_that_are_none_are_refused():
 
 def test_a_patch_that_a_diagnosis_moved_is_carried_over_once():
     """With nothing added, what is rehearsed is what the model's world shows of the episode."""
-    recording = by_hand()
+    recording = make_hand_episode()
     named = {h.name: h for h in list_known_hypotheses()}
     for name, amplitude in (("robot.regrasp", 0.012), ("obs.clock", 0.02)):
         model = build_base_model(recording).with_hypothesis(named[name], amplitude)
@@ -250,7 +258,7 @@ def test_a_patch_that_a_diagnosis_moved_is_carried_over_once():
 
 def test_pieces_are_those_of_the_cloth_whatever_a_grip_really_holds():
     """A patch that a diagnosis moved stretches the world's pattern there, and nothing that is seen."""
-    recording = by_hand()
+    recording = make_hand_episode()
     named = {h.name: h for h in list_known_hypotheses()}
     models = [build_base_model(recording), build_base_model(recording).with_hypothesis(named["robot.regrasp"], 0.012)]
     uv = recording.cloth.uv[::7]
@@ -266,20 +274,20 @@ def test_pieces_are_those_of_the_cloth_whatever_a_grip_really_holds():
 
 
 def test_a_goal_of_another_cloth_leaves_the_journal_of_this_one(tmp_path):
-    recording = by_hand()
+    recording = make_hand_episode()
     (tmp_path / "kept").mkdir()
     (tmp_path / "kept" / "own.txt").write_text("stays")
     before = sorted(tmp_path.rglob("*"))
     beyond = Goal(torch.zeros(1, 3), uv=torch.tensor([[9.0, 0.0]]))
     with pytest.raises(InvalidInput, match="off the cloth"):
-        tc.plan(cloth_of(recording), recording, beyond, journal=tmp_path / "kept", resume=False)
+        tc.plan(build_nominal_cloth(recording), recording, beyond, journal=tmp_path / "kept", resume=False)
     assert sorted(tmp_path.rglob("*")) == before
 
 
 def test_in_float32_too():
     torch.set_default_dtype(torch.float32)
-    recording = by_hand()
-    cloth = cloth_of(recording)
+    recording = make_hand_episode()
+    cloth = build_nominal_cloth(recording)
     x = build_episode(cloth, recording, 20.0).initial
     result = tc.plan(cloth, recording, Goal(x + torch.tensor([0.06, 0.0, 0.0])), wait=WAIT, iterations=2)
     assert result.frames.dtype == torch.float32
@@ -290,8 +298,8 @@ def test_in_float32_too_where_the_first_frame_is_between_knots():
     """Whole numbers may come from JSON, as 2.0."""
     torch.set_default_dtype(torch.float32)
     seen = rec.PointClouds(np.array([0.0, 0.1, 0.2]), np.tile([0.0, 0.1, 0.45], (3, 1)), np.ones(3, int))
-    recording = replace(by_hand(), points=seen, clock_offset=0.105)  # 0.105 is less in float32
-    cloth = cloth_of(recording)
+    recording = replace(make_hand_episode(), points=seen, clock_offset=0.105)  # 0.105 is less in float32
+    cloth = build_nominal_cloth(recording)
     x = build_episode(cloth, recording, 20.0).initial
     result = tc.plan(
         cloth, recording, Goal(x + torch.tensor([0.03, 0.0, 0.0])), wait=WAIT, waypoints=2.0, iterations=1.0
@@ -300,9 +308,9 @@ def test_in_float32_too_where_the_first_frame_is_between_knots():
 
 
 def test_two_hands_with_knots_of_their_own():
-    recording = by_hand()
+    recording = make_hand_episode()
     one = recording.grippers["hand"]
-    t = np.linspace(0.0, LASTS, 13)
+    t = np.linspace(0.0, DURATION_S, 13)
     place = np.stack([np.interp(t, one.t, custom) for custom in one.position.T], -1)
     other = rec.GripperMotion(t, place, np.tile([1.0, 0, 0, 0], (13, 1)), np.ones(13, bool))
     left, right = (
@@ -310,45 +318,49 @@ def test_two_hands_with_knots_of_their_own():
         rec.GraspInfo(uv=np.array([[0.2, 0.2]]), radius=0.04),
     )
     recording = replace(recording, grasps={"a": left, "b": right}, grippers={"a": one, "b": other})
-    result = tc.plan(cloth_of(recording), recording, shifted_goal(recording), **QUICK)
+    result = tc.plan(build_nominal_cloth(recording), recording, shifted_goal(recording), **QUICK)
     assert result.distance_after[0] < 0.4 * result.distance_before[0]
     assert set(result.motion) == {"a", "b"}
     assert len(result.motion["a"].t) == len(result.motion["b"].t)
 
 
 def test_a_gripper_that_takes_hold_on_the_way_is_refused():
-    recording = by_hand()
+    recording = make_hand_episode()
     custom = recording.grippers["hand"]
     for closed, message in ((custom.t > 0.1, "after the first frame"), ((custom.t < 0.1) | (custom.t > 0.2), "again")):
         late = replace(recording, grippers={"hand": replace(custom, closed=closed)})
         with pytest.raises(InvalidInput, match=message):
-            tc.plan(cloth_of(late), late, Goal(torch.zeros(4, 3)))
+            tc.plan(build_nominal_cloth(late), late, Goal(torch.zeros(4, 3)))
 
 
 def test_waypoints_that_tremble_are_refused():
-    recording = by_hand()
+    recording = make_hand_episode()
     with pytest.raises(InvalidInput, match=r"waypoints.*0.1 s or more"):
-        tc.plan(cloth_of(recording), recording, Goal(torch.zeros(4, 3)), waypoints=9)
+        tc.plan(build_nominal_cloth(recording), recording, Goal(torch.zeros(4, 3)), waypoints=9)
 
 
 def test_joints_that_no_arm_is_named_for_do_not_stay_beside_the_plan(tmp_path):
-    recording = replace(by_arm(), robots={})
+    recording = replace(make_arm_episode(), robots={})
     arm = tc.robots.load("rizon4", frame="tcp_closed")
     pose = arm(torch.as_tensor(recording.joints["arm"].q))
     path = tc.Trajectory(torch.as_tensor(recording.joints["arm"].t), pose, torch.ones(41, dtype=torch.bool))
     recording = replace(recording, grippers={"arm": to_gripper_motion(path)})
-    result = tc.plan(cloth_of(recording), recording, shifted_goal(recording), wait=WAIT, iterations=1)
+    result = tc.plan(build_nominal_cloth(recording), recording, shifted_goal(recording), wait=WAIT, iterations=1)
     assert not result.recording.joints
     result.save(tmp_path)
-    assert rec.read(tmp_path / "episode").grippers["arm"].t[-1] == pytest.approx(LASTS + WAIT)
+    assert rec.read(tmp_path / "episode").grippers["arm"].t[-1] == pytest.approx(DURATION_S + WAIT)
 
 
 def test_an_episode_that_begins_in_mid_motion_says_so():
-    recording = by_arm()
+    recording = make_arm_episode()
     cloud = rec.PointClouds(np.array([0.1, 0.3]), np.tile(recording.cloth.initial_vertices[:5], (2, 1)), np.full(2, 5))
     late = replace(recording, points=cloud)
     result = tc.plan(
-        cloth_of(late), late, Goal(torch.as_tensor(recording.cloth.initial_vertices)), waypoints=2, iterations=1
+        build_nominal_cloth(late),
+        late,
+        Goal(torch.as_tensor(recording.cloth.initial_vertices)),
+        waypoints=2,
+        iterations=1,
     )
     assert any("under way" in text for text in result.warnings)
     assert result.times[0] == pytest.approx(0.1)
@@ -356,6 +368,8 @@ def test_an_episode_that_begins_in_mid_motion_says_so():
 
 
 def test_a_goal_elsewhere_in_the_world_is_doubted():
-    recording = by_hand()
-    result = tc.plan(cloth_of(recording), recording, shifted_goal(recording, torch.tensor([3.0, 0, 0])), iterations=1)
+    recording = make_hand_episode()
+    result = tc.plan(
+        build_nominal_cloth(recording), recording, shifted_goal(recording, torch.tensor([3.0, 0, 0])), iterations=1
+    )
     assert any("in one world" in text for text in result.warnings)

@@ -11,19 +11,19 @@ SMALL = {"modes": 4, "window": 0.18}
 @pytest.fixture(scope="session")
 def scene():
     """The recording, and where the fit's vertices truly were [T, V, 3] m."""
-    with twins.doubles():
-        return occluded_twins.twin()
+    with twins.use_float64():
+        return occluded_twins.make_occluded_twin()
 
 
 @pytest.fixture(scope="session")
 def right(scene):
     """With the true values."""
-    with twins.doubles():
-        return estimate_pose(occluded_twins.model(scene, twins.TRUE), scene.recording, **SMALL)
+    with twins.use_float64():
+        return estimate_pose(occluded_twins.build_cloth(scene, twins.TRUE_FABRIC), scene.recording, **SMALL)
 
 
 @pytest.fixture(scope="session")
 def wrong(scene):
     """Half the stiffness and half the drag, taken as exact."""
-    with twins.doubles():
-        return estimate_pose(occluded_twins.model(scene, occluded_twins.WRONG), scene.recording, **SMALL)
+    with twins.use_float64():
+        return estimate_pose(occluded_twins.build_cloth(scene, occluded_twins.WRONG_FABRIC), scene.recording, **SMALL)

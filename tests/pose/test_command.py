@@ -13,7 +13,7 @@ from torchcloth.identification import identify, load_fitted_cloth
 
 @pytest.fixture(scope="module")
 def folder(scene, tmp_path_factory):
-    return recordings.write(twins.first(scene.recording, 5), tmp_path_factory.mktemp("pose") / "episode")
+    return recordings.write(twins.take_first_frames(scene.recording, 5), tmp_path_factory.mktemp("pose") / "episode")
 
 
 def test_writes_what_it_found(folder, tmp_path, capsys):
@@ -33,10 +33,10 @@ def test_writes_what_it_found(folder, tmp_path, capsys):
 
 
 def test_takes_a_fit(scene, folder, tmp_path):
-    short = twins.first(scene.recording, 5)
-    fit = identify(twins.at(short), short, ["youngs_modulus"], iterations=2)
+    short = twins.take_first_frames(scene.recording, 5)
+    fit = identify(twins.build_cloth_at(short), short, ["youngs_modulus"], iterations=2)
     fit.save(tmp_path)
-    other = twins.first(scene.recording, 7)  # not the fitted episode
+    other = twins.take_first_frames(scene.recording, 7)  # not the fitted episode
     cloth, uncertain = load_fitted_cloth(tmp_path, other)
     result = fit.parameters["youngs_modulus"]
     assert cloth.material.youngs_modulus.value.item() == pytest.approx(result.value)

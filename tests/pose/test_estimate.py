@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 from helpers import twins
-from helpers.occluded_twins import WRONG, model
+from helpers.occluded_twins import WRONG_FABRIC, build_cloth
 
 from torchcloth import recordings as rec
 from torchcloth.effects import BodyForce
@@ -59,16 +59,21 @@ def test_a_wrong_model_says_so_and_is_still_better_than_itself(scene, wrong):
 
 def test_stated_uncertainty_is_used(scene, right):
     """The same wrong values, known to within a factor of two: the fabric is corrected, not the force."""
-    uncertain = {"youngs_modulus": (WRONG.membrane / twins.THICKNESS, 2.0), "air.normal": (WRONG.drag, 0.6)}
-    result = estimate_pose(model(scene, WRONG), scene.recording, uncertain=uncertain, modes=4, window=0.18)
+    uncertain = {
+        "youngs_modulus": (WRONG_FABRIC.membrane / twins.THICKNESS_M, 2.0),
+        "air.normal": (WRONG_FABRIC.drag, 0.6),
+    }
+    result = estimate_pose(build_cloth(scene, WRONG_FABRIC), scene.recording, uncertain=uncertain, modes=4, window=0.18)
     assert rms(result.x, scene, scene.hidden) < 1.2 * rms(right.x, scene, scene.hidden)
     assert result.fit["force_fraction"] < 0.06
-    assert result.parameters["youngs_modulus"].value == pytest.approx(twins.TRUE.membrane / twins.THICKNESS, rel=0.05)
+    assert result.parameters["youngs_modulus"].value == pytest.approx(
+        twins.TRUE_FABRIC.membrane / twins.THICKNESS_M, rel=0.05
+    )
 
 
 def test_one_continuous_motion(scene, wrong):
     """Every window goes on from the state that the one before left: simulated in one piece it is the same motion."""
-    cloth = model(scene, WRONG)
+    cloth = build_cloth(scene, WRONG_FABRIC)
     cloth.effects["push"] = BodyForce(torch.zeros_like(wrong.x[0]))
     motion = build_episode(cloth, scene.recording).motion
     for w in range(1, len(wrong.windows)):
@@ -82,7 +87,7 @@ def test_one_continuous_motion(scene, wrong):
 
 
 def test_shares_are_those_of_the_weight(wrong, scene):
-    cloth = model(scene, WRONG)
+    cloth = build_cloth(scene, WRONG_FABRIC)
     gripped = torch.cat([part.index for part in cloth.boundaries.values()])
     mass = cloth.build_model().mass.detach()[:, 0]
     mass[gripped] = 0
@@ -91,14 +96,14 @@ def test_shares_are_those_of_the_weight(wrong, scene):
 
 
 def test_distances_are_those_of_the_room_next_door(scene, right):
-    cloth = model(scene, twins.TRUE)
+    cloth = build_cloth(scene, twins.TRUE_FABRIC)
     again = distance_metrics([right.x], [build_episode(cloth, scene.recording)], right.faces)
     assert right.fit["chamfer_after"] == pytest.approx(again.chamfer)
 
 
 def test_the_last_state_goes_on(scene, right):
     assert isinstance(right.last_state, ClothState)
-    cloth = model(scene, twins.TRUE)
+    cloth = build_cloth(scene, twins.TRUE_FABRIC)
     x = right.last_state.x.clone().requires_grad_()
     out = cloth(right.last_state._replace(x=x), build_episode(cloth, scene.recording).motion, [0.70, 0.71])
     out.x[-1, :, 2].mean().backward()
@@ -106,7 +111,7 @@ def test_the_last_state_goes_on(scene, right):
 
 
 def test_another_effect_of_that_name_is_not_overwritten(scene):
-    cloth = model(scene, twins.TRUE)
+    cloth = build_cloth(scene, twins.TRUE_FABRIC)
     cloth.effects["correction"] = BodyForce(torch.zeros(1, 3))
     with pytest.raises(InvalidInput, match="correction"):
         estimate_pose(cloth, scene.recording)
@@ -115,12 +120,12 @@ def test_another_effect_of_that_name_is_not_overwritten(scene):
 def test_markers_alone(scene):
     """The full mesh from a few material points that are seen now and then."""
     uv = np.array([[0.1, 0.1], [0.2, 0.05], [0.1, 0.2], [0.2, 0.25], [0.15, 0.15]])
-    mesh = model(scene, twins.TRUE).mesh
-    xyz = np.stack([twins.bilinear(x, twins.FIT, uv) for x in scene.truth.numpy()])
+    mesh = build_cloth(scene, twins.TRUE_FABRIC).mesh
+    xyz = np.stack([twins.interpolate_bilinear(x, twins.FIT_RESOLUTION, uv) for x in scene.truth.numpy()])
     xyz[::3, :2] = np.nan
     times = scene.recording.points.t
     recording = replace(scene.recording, points=None, markers=rec.Markers(times, xyz, uv))
-    result = estimate_pose(model(scene, WRONG), recording, modes=4, window=0.18)
+    result = estimate_pose(build_cloth(scene, WRONG_FABRIC), recording, modes=4, window=0.18)
     assert np.isfinite(result.std.numpy()).all()
     assert rms(result.x, scene, scene.hidden) < 0.6 * rms(result.uncorrected, scene, scene.hidden)
     assert any("no points" in warning for warning in result.warnings)
@@ -132,11 +137,11 @@ def test_markers_alone(scene):
 def test_nothing_need_be_seen_at_the_beginning(scene):
     """Early stages without data were refused as if the whole had none."""
     uv = np.array([[0.1, 0.1], [0.2, 0.05], [0.1, 0.2], [0.2, 0.25]])
-    xyz = np.stack([twins.bilinear(x, twins.FIT, uv) for x in scene.truth.numpy()])
+    xyz = np.stack([twins.interpolate_bilinear(x, twins.FIT_RESOLUTION, uv) for x in scene.truth.numpy()])
     xyz[: len(xyz) // 2] = np.nan
     markers = rec.Markers(scene.recording.points.t, xyz, uv)
     result = estimate_pose(
-        model(scene, WRONG), replace(scene.recording, points=None, markers=markers), modes=4, window=0.18
+        build_cloth(scene, WRONG_FABRIC), replace(scene.recording, points=None, markers=markers), modes=4, window=0.18
     )
     late = scene.hidden.clone()
     late[: len(late) // 2] = False
@@ -148,13 +153,13 @@ def test_nothing_seen_at_all_is_said(scene):
     blind = rec.Markers(scene.recording.points.t, np.full((len(scene.truth), 1, 3), np.nan), np.array([[0.1, 0.1]]))
     recording = replace(scene.recording, points=None, grippers=hands, markers=blind)
     with pytest.raises(RecordingError, match="nothing to estimate from"):
-        estimate_pose(model(scene, twins.TRUE), recording)
+        estimate_pose(build_cloth(scene, twins.TRUE_FABRIC), recording)
 
 
 def test_a_search_that_can_make_no_step_has_not_converged(scene):
     """Stiffer cloth has no such step; that no step was made passed for a small one."""
-    cloth = model(scene, replace(twins.TRUE, membrane=0.2 * twins.TRUE.membrane))
-    soft = 0.2 * twins.TRUE.membrane / twins.THICKNESS
+    cloth = build_cloth(scene, replace(twins.TRUE_FABRIC, membrane=0.2 * twins.TRUE_FABRIC.membrane))
+    soft = 0.2 * twins.TRUE_FABRIC.membrane / twins.THICKNESS_M
     stuck = {"uncertain": {"youngs_modulus": (soft, 4.0)}, "dt": 0.999 * cloth.stable_step()}
     result = estimate_pose(cloth, scene.recording, modes=2, window=0.35, **stuck)
     assert not result.fit["converged"]
@@ -162,7 +167,9 @@ def test_a_search_that_can_make_no_step_has_not_converged(scene):
 
 
 def test_stated_noise_is_what_points_are_compared_with(scene):
-    result = estimate_pose(model(scene, twins.TRUE), scene.recording, modes=4, window=0.18, noise={"points": 3e-3})
+    result = estimate_pose(
+        build_cloth(scene, twins.TRUE_FABRIC), scene.recording, modes=4, window=0.18, noise={"points": 3e-3}
+    )
     assert result.fit["point_noise"] == 3e-3
     assert result.warnings == []
 
@@ -171,7 +178,7 @@ def test_what_a_gripper_has_let_go_is_as_uncertain_as_the_rest(scene, right):
     """Its patch was taken for held to the end, and known to the last digit."""
     hands = scene.recording.grippers
     left = replace(hands["left"], closed=hands["left"].t < 0.53)  # until the knot at 0.54 s
-    cloth = model(scene, twins.TRUE)
+    cloth = build_cloth(scene, twins.TRUE_FABRIC)
     data = build_episode(cloth, replace(scene.recording, grippers={**hands, "left": left}))
     gripped, patch = find_gripped_vertices(cloth, data), cloth.boundaries["left"].index
     assert torch.equal(gripped[:, patch].all(1), data.times < 0.54)
@@ -185,7 +192,7 @@ def test_forces_are_no_blindness(scene):
     pull = np.random.default_rng(0).normal(0, 0.05, (len(scene.recording.grippers["left"].t), 3))
     hands = {name: replace(motion, force=pull) for name, motion in scene.recording.grippers.items()}
     felt = replace(scene.recording, grippers=hands)
-    result = estimate_pose(model(scene, twins.TRUE), felt, modes=4, window=0.18, use=["force"])
+    result = estimate_pose(build_cloth(scene, twins.TRUE_FABRIC), felt, modes=4, window=0.18, use=["force"])
     assert not any("seen or felt" in warning for warning in result.warnings)
 
 
@@ -199,7 +206,7 @@ def few(recording, count):
 
 def test_few_points_of_unknown_noise_are_not_taken_for_exact(scene):
     """Too few to tell noise from shape: taken as exact, they made every error three times as large."""
-    sparse, cloth = few(scene.recording, 60), model(scene, twins.TRUE)
+    sparse, cloth = few(scene.recording, 60), build_cloth(scene, twins.TRUE_FABRIC)
     stated = estimate_pose(cloth, sparse, modes=4, window=0.18)
     unknown = estimate_pose(cloth, replace(sparse, observation_noise_std=None), modes=4, window=0.18)
     assert unknown.fit["std_rms"] == pytest.approx(stated.fit["std_rms"], rel=0.2)
@@ -210,12 +217,12 @@ def test_few_points_of_unknown_noise_are_not_taken_for_exact(scene):
 def test_what_is_not_used_was_not_seen(scene, use, noise):
     """The points are there, and tell of distances only: all else is as if they were not."""
     uv = np.array([[0.1, 0.1], [0.2, 0.2]])
-    xyz = np.stack([twins.bilinear(x, twins.FIT, uv) for x in scene.truth.numpy()])
+    xyz = np.stack([twins.interpolate_bilinear(x, twins.FIT_RESOLUTION, uv) for x in scene.truth.numpy()])
     pull = np.random.default_rng(0).normal(0, 0.05, (len(scene.recording.grippers["left"].t), 3))
     grippers = {name: replace(motion, force=pull) for name, motion in scene.recording.grippers.items()}
     markers = rec.Markers(scene.recording.points.t, xyz, uv)
     whole = replace(scene.recording, grippers=grippers, markers=markers, observation_noise_std=noise)
-    ask = partial(estimate_pose, model(scene, WRONG), modes=4, window=0.18, use=[use])
+    ask = partial(estimate_pose, build_cloth(scene, WRONG_FABRIC), modes=4, window=0.18, use=[use])
     result, alone = ask(whole), ask(replace(whole, points=None))
     torch.testing.assert_close(result.x, alone.x)
     torch.testing.assert_close(result.std, alone.std)
@@ -243,12 +250,12 @@ def test_what_is_not_used_was_not_seen(scene, use, noise):
 )
 def test_bad_options(scene, options, match):
     with pytest.raises(InvalidInput, match=match):
-        estimate_pose(model(scene, twins.TRUE), scene.recording, **options)
+        estimate_pose(build_cloth(scene, twins.TRUE_FABRIC), scene.recording, **options)
 
 
 def test_a_late_clock_sees_beyond_the_last_stamp(scene, monkeypatch):
     """Frames taken later than they say: the last is where the cloth was then, which takes simulating on."""
-    late, stored = 0.6 / twins.RATE, slice(0, -4)
+    late, stored = 0.6 / twins.FRAME_RATE_HZ, slice(0, -4)
     points = scene.recording.points
     counts = points.counts[stored]
     stamps = np.concatenate([points.t[:1], points.t[stored][1:] - late])
@@ -266,7 +273,9 @@ def test_a_late_clock_sees_beyond_the_last_stamp(scene, monkeypatch):
         assert float(result.windows[-1, 1]) == pytest.approx(float(result.times[-1]))
         return float((result.x[-1] - scene.truth[len(counts) - 1]).norm(dim=-1).square().mean().sqrt())
 
-    ask = partial(estimate_pose, model(scene, twins.TRUE), seen, nuisances={"clock": 0.03}, modes=4, window=0.18)
+    ask = partial(
+        estimate_pose, build_cloth(scene, twins.TRUE_FABRIC), seen, nuisances={"clock": 0.03}, modes=4, window=0.18
+    )
     result = ask()
     assert result.nuisances["clock"].value == pytest.approx(late, rel=0.1)
     monkeypatch.setattr(nuisances, "MAX_CLOCK_OFFSET_STDS", 0.0)
@@ -275,7 +284,7 @@ def test_a_late_clock_sees_beyond_the_last_stamp(scene, monkeypatch):
 
 def test_few_points_of_each_frame_tell_together(scene):
     """12 points a frame tell no field from noise, 12 of each of two frames do: the errors are not zero."""
-    cloth = model(scene, WRONG)
+    cloth = build_cloth(scene, WRONG_FABRIC)
     data = build_episode(cloth, scene.recording)
     few = replace(data, clouds=[cloud[:12] for cloud in data.clouds])
     gripped, modes, x = (
@@ -293,8 +302,8 @@ def test_few_points_of_each_frame_tell_together(scene):
 
 
 def test_the_values_that_it_moved_with_can_be_set(scene):
-    uncertain = {"youngs_modulus": (WRONG.membrane / twins.THICKNESS, 2.0)}
-    cloth = model(scene, WRONG)
+    uncertain = {"youngs_modulus": (WRONG_FABRIC.membrane / twins.THICKNESS_M, 2.0)}
+    cloth = build_cloth(scene, WRONG_FABRIC)
     result = estimate_pose(cloth, scene.recording, uncertain=uncertain, modes=2, window=0.3)
     value = result.parameters["youngs_modulus"].value
     assert value > 1.2 * uncertain["youngs_modulus"][0]

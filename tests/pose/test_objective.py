@@ -5,7 +5,7 @@ from itertools import pairwise
 import pytest
 import torch
 from helpers import twins
-from helpers.occluded_twins import model
+from helpers.occluded_twins import build_cloth
 
 from torchcloth.episodes.replay import Replay
 from torchcloth.episodes.unknowns import collect_unknowns
@@ -19,8 +19,8 @@ from torchcloth.pose.objective import CorrectedObjective, CorrectiveForce, add_c
 
 @pytest.fixture
 def objective(scene):
-    cloth = model(scene, twins.TRUE)
-    data = build_episode(cloth, twins.first(scene.recording, 6))
+    cloth = build_cloth(scene, twins.TRUE_FABRIC)
+    data = build_episode(cloth, twins.take_first_frames(scene.recording, 6))
     correction = CorrectiveForce(
         split_into_windows(data.times, 0.1), compute_modes(cloth.mesh, 2).fields, torch.full((2,), 0.5)
     )
@@ -34,7 +34,7 @@ def objective(scene):
 def test_without_force_it_is_the_simulation(objective, scene):
     frames = objective.simulate_vertices(objective.start)[0]
     with torch.no_grad():
-        whole = Replay(model(scene, twins.TRUE))(objective.episodes[0]).x
+        whole = Replay(build_cloth(scene, twins.TRUE_FABRIC))(objective.episodes[0]).x
     torch.testing.assert_close(frames, whole, rtol=0, atol=1e-12)
 
 
@@ -98,8 +98,8 @@ def test_a_part_is_the_beginning_of_the_same_motion(objective):
 
 def test_the_early_frames_of_a_fit_are_the_beginning_of_the_same_motion(scene):
     """``identify`` never sets velocity or rest shape anew: what it begins with is a prefix."""
-    cloth = model(scene, twins.TRUE)
-    data = build_episode(cloth, twins.first(scene.recording, 8))
+    cloth = build_cloth(scene, twins.TRUE_FABRIC)
+    data = build_episode(cloth, twins.take_first_frames(scene.recording, 8))
     whole = Objective(cloth, collect_unknowns(cloth, ["youngs_modulus"], None), [data])
     raw = whole.start + 0.1
     torch.testing.assert_close(

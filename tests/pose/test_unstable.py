@@ -14,7 +14,7 @@ SIDE, FIT, RATE = 0.3, (7, 7), 20.0
 
 
 def cloth(shape):
-    fabric, count = twins.TRUE, shape[0] * shape[1]
+    fabric, count = twins.TRUE_FABRIC, shape[0] * shape[1]
     effects = {
         "gravity": tc.effects.Gravity(),
         "bending": tc.effects.Bending(fabric.bending, fabric.damping_time),
@@ -28,7 +28,7 @@ def cloth(shape):
 
 def shaken(frames):
     """(recording, the truth at the fitted mesh's vertices [T, V, 3])."""
-    draw, truth, t = np.random.default_rng(0), cloth(twins.TRUTH), np.arange(frames) / RATE
+    draw, truth, t = np.random.default_rng(0), cloth(twins.TRUTH_RESOLUTION), np.arange(frames) / RATE
     of_part = np.linspace(0, t[-1], 60)
     sway, still = 0.04 * (1 - np.cos(2 * np.pi * 2.5 * of_part)), np.tile([1.0, 0, 0, 0], (60, 1))
     motion = {
@@ -44,11 +44,17 @@ def shaken(frames):
         path = replay(rec.Recording(cloth=rec.ClothInfo(areal_density=1.0), provenance="x", grippers=motion))
         state = truth.settle(truth.state(hanging), path, duration=1.0, rate=15.0)
         x = truth(state, path, t.tolist(), dt=0.6 * truth.stable_step()).x.numpy()
-    seen = np.concatenate([twins.bilinear(frame, twins.TRUTH, SIDE * draw.random((120, 2))) for frame in x])
+    seen = np.concatenate(
+        [twins.interpolate_bilinear(frame, twins.TRUTH_RESOLUTION, SIDE * draw.random((120, 2))) for frame in x]
+    )
     mesh = tc.meshes.rectangle(SIDE, SIDE, resolution=FIT)
-    at = np.stack([twins.bilinear(frame, twins.TRUTH, np.asarray(mesh.uv)) for frame in x])
+    at = np.stack([twins.interpolate_bilinear(frame, twins.TRUTH_RESOLUTION, np.asarray(mesh.uv)) for frame in x])
     known = rec.ClothInfo(
-        areal_density=twins.TRUE.density, vertices=mesh.vertices, faces=mesh.faces, uv=mesh.uv, initial_vertices=at[0]
+        areal_density=twins.TRUE_FABRIC.density,
+        vertices=mesh.vertices,
+        faces=mesh.faces,
+        uv=mesh.uv,
+        initial_vertices=at[0],
     )
     grasps = {"left": rec.GraspInfo(vertices=np.array([6])), "right": rec.GraspInfo(vertices=np.array([48]))}
     points = rec.PointClouds(t, seen + 1e-3 * draw.standard_normal(seen.shape), np.full(frames, 120))
@@ -59,7 +65,7 @@ def shaken(frames):
 @pytest.mark.slow
 def test_an_unstable_motion_is_followed_and_said():
     """8 fields over 1.25 s, where normal equations lost all digits; the estimate says that it is one of many."""
-    with twins.doubles():
+    with twins.use_float64():
         recording, truth = shaken(26)
         result = estimate_pose(cloth(FIT), recording, modes=8)
     off, alone = ((x - truth).square().sum(-1).mean().sqrt() for x in (result.x, result.uncorrected))

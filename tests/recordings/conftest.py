@@ -5,14 +5,14 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
-from helpers.rich_recording import compare, make_recording
+from helpers.rich_recording import check_equal, make_recording
 
 from torchcloth import recordings as rec
 
 
 @pytest.fixture(scope="session")
 def assert_same():
-    return compare
+    return check_equal
 
 
 @pytest.fixture

@@ -16,12 +16,12 @@ SMALL = (5, 5)
 
 def tiny(amplitude: float, motion: str = "shake") -> rec.Recording:
     """Two frames after the first, noise-free points on the true sheet (E h = 40 N/m, the data sheet says 80)."""
-    cloth = twins.cloth(twins.TRUE, SMALL)
-    drive = twins.shake(amplitude)
+    cloth = twins.make_cloth(twins.TRUE_FABRIC, SMALL)
+    drive = twins.make_shaking_motion(amplitude)
     t = np.array([0.0, 0.05, 0.1])
     info = rec.ClothInfo(
-        areal_density=twins.TRUE.density,
-        thickness=twins.THICKNESS,
+        areal_density=twins.TRUE_FABRIC.density,
+        thickness=twins.THICKNESS_M,
         vertices=cloth.mesh.vertices,
         faces=cloth.mesh.faces,
         uv=cloth.mesh.uv,
@@ -34,13 +34,13 @@ def tiny(amplitude: float, motion: str = "shake") -> rec.Recording:
     )
     with torch.no_grad():
         trajectories = twins.replay(rec.Recording(cloth=info, provenance="synthetic: tests", grippers=drive))
-        state = cloth.settle(cloth.state(twins.hammock(cloth)), trajectories, duration=2.0, rate=15.0)
+        state = cloth.settle(cloth.state(twins.flat_positions(cloth)), trajectories, duration=2.0, rate=15.0)
         x = cloth(state, trajectories, t.tolist()).x.numpy()
     # measured where the vertices are: distances vanish with the true values only
     return rec.Recording(
         cloth=replace(info, initial_vertices=x[0]),
         provenance="synthetic: tests",
-        grasps={name: rec.GraspInfo(twins.jaw(name), twins.RADIUS) for name in twins.EDGES},
+        grasps={name: rec.GraspInfo(twins.jaw_points(name), twins.GRASP_RADIUS_M) for name in twins.GRASPED_EDGES_U_M},
         grippers=drive,
         points=rec.PointClouds(t, x.reshape(-1, 3), np.full(3, x.shape[1])),
         air_density=1.204,
@@ -52,7 +52,7 @@ def tiny(amplitude: float, motion: str = "shake") -> rec.Recording:
 def episodes(tmp_path_factory) -> Path:
     """Folder with ep_0, ep_1, ep_2 (motion "shake") and held (motion "other")."""
     folder = tmp_path_factory.mktemp("episodes")
-    with twins.doubles():
+    with twins.use_float64():
         for i, amplitude in enumerate((0.06, 0.1, 0.14)):
             rec.write(tiny(amplitude), folder / f"ep_{i}")
         rec.write(tiny(0.08, "other"), folder / "held")

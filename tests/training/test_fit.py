@@ -24,7 +24,7 @@ from torchcloth.training.fit.learned_cloth import LearnedCloth
 from torchcloth.training.fit.module import FitModule
 
 NETWORK = {
-    "module": "helpers.user_networks.Small",
+    "module": "helpers.user_networks.SmallNetwork",
     "outputs": ["youngs_modulus"],
     "arguments": {"width": 3, "drop": 0.3},
 }
@@ -121,7 +121,7 @@ def test_resuming_is_bit_for_bit(config, episodes, tmp_path, monkeypatch, step):
 def test_a_gradient_that_is_no_number_is_not_followed(config, tmp_path, capsys):
     """The checkpoint is from the step before, and can be gone on from."""
     path = config(
-        learn={"network": {"module": "helpers.user_networks.Spoilt", "outputs": ["youngs_modulus"]}},
+        learn={"network": {"module": "helpers.user_networks.NanGradientNetwork", "outputs": ["youngs_modulus"]}},
         optimizer={"steps": 4},
     )
     for again in ([], ["--resume"]):

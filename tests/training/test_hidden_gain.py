@@ -26,7 +26,7 @@ def case(tmp_path_factory):
     torch.set_default_dtype(torch.float64)
     paths = {}
     for k, motion in enumerate(("slow", "lift", "fast")):
-        recording = sheet_episodes.recorded(motion, lambda world: DRAG.apply(world, TRUE), k)
+        recording = sheet_episodes.record_changed_world(motion, lambda world: DRAG.apply(world, TRUE), k)
         paths[motion] = rec.write(recording, folder / motion)
     recordings = [rec.read(paths[name]) for name in ("slow", "lift")]
     model = build_base_model(recordings[0])

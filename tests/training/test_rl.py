@@ -5,7 +5,7 @@ import warnings
 import numpy as np
 import pytest
 import torch
-from helpers.planning_scenes import by_arm, by_hand, cloth_of
+from helpers.planning_scenes import build_nominal_cloth, make_arm_episode, make_hand_episode
 
 from torchcloth.errors import InvalidInput, SimulationDiverged
 from torchcloth.planning import Goal
@@ -22,7 +22,7 @@ WAIT = 0.1
 
 def task_of(recording, way=(0.04, 0.02, 0.03), waypoints=2, judge=None):
     """Where the recorded motion's cloth would be if all were shifted."""
-    cloth = cloth_of(recording).requires_grad_(False)
+    cloth = build_nominal_cloth(recording).requires_grad_(False)
     courses = [
         make_stepwise(c)
         for c in extract_motion_parameters(
@@ -43,7 +43,7 @@ def test_a_step_is_done_in_its_own_stretch_of_time():
     assert torch.allclose(share[3:], torch.ones(2, 4))
 
 
-@pytest.mark.parametrize("scene", [by_hand, by_arm])
+@pytest.mark.parametrize("scene", [make_hand_episode, make_arm_episode])
 def test_it_is_an_environment(scene):
     from gymnasium.utils.env_checker import check_env
 
@@ -53,8 +53,8 @@ def test_it_is_an_environment(scene):
 
 
 def test_of_an_episode_it_is_what_is_planned_in():
-    recording, wanted = by_arm(), task_of(by_arm(), waypoints=3)
-    cloth = cloth_of(recording).requires_grad_(False)
+    recording, wanted = make_arm_episode(), task_of(make_arm_episode(), waypoints=3)
+    cloth = build_nominal_cloth(recording).requires_grad_(False)
     env = ReachEnv.of(cloth, recording, wanted.goal, waypoints=3, wait=WAIT)
     assert env.intervals == 3
     assert env.task.evaluate(env.task.start) == wanted.evaluate(wanted.start)
@@ -67,7 +67,7 @@ def test_of_an_episode_it_is_what_is_planned_in():
 
 
 def test_step_by_step_the_cloth_goes_where_the_whole_motion_brings_it():
-    task = task_of(by_arm(), waypoints=3)
+    task = task_of(make_arm_episode(), waypoints=3)
     tried = []
     env = ReachEnv(task, tried.append)
     env.reset()
@@ -84,13 +84,13 @@ def test_step_by_step_the_cloth_goes_where_the_whole_motion_brings_it():
 
 def test_what_is_in_the_way_is_not_stepped_into():
     class Wall:
-        def nearest(self, q):
+        def smallest_gap(self, q):
             return None, "in the way" if float((q["arm"] - recorded).abs().max()) > 0.02 else None
 
-    course = task_of(by_arm()).motions[0]
+    course = task_of(make_arm_episode()).motions[0]
     recorded = course.coordinates_at_check_times(course.zero_waypoints)
 
-    env = ReachEnv(task_of(by_arm(), judge=Wall()))
+    env = ReachEnv(task_of(make_arm_episode(), judge=Wall()))
     env.reset()
     for _ in range(2):
         env.step(np.ones(env.count))
@@ -99,12 +99,12 @@ def test_what_is_in_the_way_is_not_stepped_into():
 
 def test_a_motion_that_cannot_be_simulated_ends_there(monkeypatch):
     tried = []
-    env = ReachEnv(task_of(by_hand()), tried.append)
+    env = ReachEnv(task_of(make_hand_episode()), tried.append)
 
     def torn(*arguments):
         raise SimulationDiverged("torn")
 
-    monkeypatch.setattr(env.run, "go_on", torn)
+    monkeypatch.setattr(env.run, "simulate_interval", torn)
     env.reset()
     _, reward, over, _, _ = env.step(np.zeros(env.count))
     assert over
@@ -115,7 +115,7 @@ def test_a_motion_that_cannot_be_simulated_ends_there(monkeypatch):
 
 
 def test_sac_comes_nearer():
-    found = learn(task_of(by_hand()), motions=60, random_motions=20)
+    found = learn(task_of(make_hand_episode()), motions=60, random_motions=20)
     assert len(found.history) == 61
     assert found.history[-1] == found.policy
     assert min(found.history) < 0.6 * found.history[0]

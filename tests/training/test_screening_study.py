@@ -12,7 +12,7 @@ from torchcloth.training.studies.command import main
 
 
 def evidence(truth=(0.0, 0.3, 0.0, 0.7, 0.0), mesh=0.0):
-    fitted = toys.evidence(toys.smooth(1, 6), 2, ["a", "b", "c"], torch.tensor(truth).double(), 0)
+    fitted = toys.draw_linearisation(toys.draw_jacobian(1, 6), 2, ["a", "b", "c"], torch.tensor(truth).double(), 0)
     return fitted.__class__(
         fitted.bins,
         fitted.n_coordinates,
@@ -23,7 +23,7 @@ def evidence(truth=(0.0, 0.3, 0.0, 0.7, 0.0), mesh=0.0):
 
 
 def test_independent_errors_are_as_large_and_agree_with_nobody():
-    fitted = toys.fitted(evidence())
+    fitted = toys.make_model_fit(evidence())
     other = screening_ablations.without_error_correlation(fitted)
     cells, nothing = fitted.linearisation.bins[0], torch.zeros(0).double()
     usual, alone = (f.noise.covariance(cells, cells.jacobian[:, :0], nothing) for f in (fitted, other))
@@ -34,21 +34,23 @@ def test_independent_errors_are_as_large_and_agree_with_nobody():
 
 
 def test_exact_episodes_keep_all_but_their_nuisances():
-    fitted = toys.fitted(evidence())
+    fitted = toys.make_model_fit(evidence())
     other = screening_ablations.without_nuisances(fitted)
     assert all(float(s.max()) < 1e-11 for s in other.linearisation.nuisance_stds)
     assert all(a is b for a, b in zip(fitted.linearisation.bins, other.linearisation.bins, strict=True))
 
 
 def with_zero_threshold_only_what_matters_changes():
-    rows = {r.hypothesis.name: r for r in screen(screening_ablations.with_zero_threshold(toys.fitted(evidence())))}
-    for r in screen(toys.fitted(evidence())):
+    rows = {
+        r.hypothesis.name: r for r in screen(screening_ablations.with_zero_threshold(toys.make_model_fit(evidence())))
+    }
+    for r in screen(toys.make_model_fit(evidence())):
         assert rows[r.hypothesis.name].amplitude == r.amplitude
         assert rows[r.hypothesis.name].hypothesis.smallest_of_interest == 0.0 < r.hypothesis.smallest_of_interest
 
 
 def test_on_one_mesh_residuals_are_those_of_the_given_one():
-    fitted = toys.fitted(evidence(mesh=-0.5))
+    fitted = toys.make_model_fit(evidence(mesh=-0.5))
     other = screening_ablations.without_mesh_error(fitted)
     for a, b, n in zip(
         fitted.linearisation.bins, other.linearisation.bins, fitted.linearisation.mesh_differences, strict=True
@@ -60,7 +62,7 @@ def test_on_one_mesh_residuals_are_those_of_the_given_one():
 
 def test_a_rigid_fabric_leaves_all_to_the_causes():
     """What is asked for is then the plain regression on that cause alone."""
-    fitted = screening_ablations.with_fixed_parameters(toys.fitted(evidence()))
+    fitted = screening_ablations.with_fixed_parameters(toys.make_model_fit(evidence()))
     slopes, value = fitted.whitened.jacobian[:, fitted.linearisation.n_coordinates :], fitted.whitened.value
     for r in screen(fitted):
         k = [h.name for h in fitted.linearisation.hypotheses].index(r.hypothesis.name)

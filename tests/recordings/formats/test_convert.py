@@ -19,7 +19,7 @@ def test_the_choices_are_the_formats():
 
 
 def test_a_folder_becomes_an_episode_and_the_episode_mcap(tmp_path, capsys):
-    truth = foreign_formats.tum(tmp_path)
+    truth = foreign_formats.write_tum(tmp_path)
     scene, episode, bag = truth.write_scene(), tmp_path / "ep", tmp_path / "ep.mcap"
     assert call(truth.path, episode, "--scene", scene, "--from", "tum") == 0
     message = capsys.readouterr().out
@@ -33,7 +33,7 @@ def test_a_folder_becomes_an_episode_and_the_episode_mcap(tmp_path, capsys):
 
 
 def test_a_refusal_is_one_line_and_leaves_nothing(tmp_path, capsys):
-    truth = foreign_formats.tum(tmp_path)
+    truth = foreign_formats.write_tum(tmp_path)
     out = tmp_path / "out" / "ep"
     scene = truth.write_scene()
     for arguments, match in (
@@ -57,7 +57,7 @@ def test_a_refusal_is_one_line_and_leaves_nothing(tmp_path, capsys):
 
 @pytest.mark.parametrize("suffix", ["", ".mcap"])
 def test_nothing_is_overwritten_unasked(tmp_path, capsys, suffix):
-    truth = foreign_formats.tum(tmp_path)
+    truth = foreign_formats.write_tum(tmp_path)
     scene, out = truth.write_scene(), tmp_path / f"ep{suffix}"
     assert call(truth.path, out, "--scene", scene) == 0
     capsys.readouterr()
@@ -67,7 +67,7 @@ def test_nothing_is_overwritten_unasked(tmp_path, capsys, suffix):
 
 
 def test_a_scene_is_not_overwritten_by_what_it_describes(tmp_path, capsys):
-    truth, out = foreign_formats.tum(tmp_path), tmp_path / "ep"
+    truth, out = foreign_formats.write_tum(tmp_path), tmp_path / "ep"
     out.mkdir()
     scene = truth.write_scene().rename(out / "scene.json")
     assert call(truth.path, out, "--scene", scene, "--overwrite") == 2
@@ -77,7 +77,7 @@ def test_a_scene_is_not_overwritten_by_what_it_describes(tmp_path, capsys):
 
 def test_the_target_must_be_what_is_written(tmp_path, capsys):
     """An episode folder that looks like a bag, and an episode written over itself."""
-    truth = foreign_formats.tum(tmp_path)
+    truth = foreign_formats.write_tum(tmp_path)
     episode = tmp_path / "ep_0.15"  # a dot alone makes no file
     assert call(truth.path, episode, "--scene", truth.write_scene()) == 0
     before = sorted((p, p.stat().st_mtime_ns) for p in episode.rglob("*"))

@@ -125,7 +125,7 @@ def mutate(rng: random.Random, files: list[Path]) -> tuple[str, set[Path]]:
     return f"{how} {file.name}", touched
 
 
-def attempt(truth: foreign_formats.Foreign, scene: Path, out: Path) -> Content | None:
+def attempt(truth: foreign_formats.ForeignRecording, scene: Path, out: Path) -> Content | None:
     """Import and write; None when it was refused, by one line and without a trace."""
     try:
         with warnings.catch_warnings():

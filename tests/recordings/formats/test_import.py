@@ -26,7 +26,9 @@ def arrays_of(recording: rec.Recording) -> dict[str, np.ndarray]:
     return {key: value for key, value in result.items() if isinstance(value, np.ndarray)}
 
 
-def check(recording: rec.Recording, truth: foreign_formats.Foreign, *, lossy: int = 0, points: float = 0.0) -> None:
+def check(
+    recording: rec.Recording, truth: foreign_formats.ForeignRecording, *, lossy: int = 0, points: float = 0.0
+) -> None:
     result = streams_of(recording)
     assert result.keys() == truth.images.keys()
     for key, stream in result.items():

@@ -30,17 +30,19 @@ def written(tmp_path_factory):
 def copy(written, tmp_path):
     """A function that copies one format here and gives its scene to be changed."""
 
-    def make(name: str) -> foreign_formats.Foreign:
+    def make(name: str) -> foreign_formats.ForeignRecording:
         truth = written[name]
         target = tmp_path / truth.path.name
         (shutil.copytree if truth.path.is_dir() else shutil.copy)(truth.path, target)
         scene = json.loads(json.dumps(truth.scene))
-        return foreign_formats.Foreign(target, scene, truth.images, truth.times, truth.arrays, dict(truth.options))
+        return foreign_formats.ForeignRecording(
+            target, scene, truth.images, truth.times, truth.arrays, dict(truth.options)
+        )
 
     return make
 
 
-def refuse(truth: foreign_formats.Foreign, match: str, **options):
+def refuse(truth: foreign_formats.ForeignRecording, match: str, **options):
     with pytest.raises((RecordingError, InvalidInput), match=match) as caught:
         formats.read(truth.path, scene=truth.write_scene(), **{**truth.options, **options})
     assert "\n" not in str(caught.value)
@@ -159,9 +161,14 @@ def test_a_folder_of_open3ds_recorder(copy):
         file.rename(file.with_name(f"{i % 3:05d}.png"))
     (truth.path / "camera_intrinsic.json").unlink()
     text = o3d.t.io.RGBDVideoMetadata()
-    text.fps, text.width, text.height, text.depth_scale = 20.0, foreign_formats.WIDTH, foreign_formats.HEIGHT, 4000.0
+    text.fps, text.width, text.height, text.depth_scale = (
+        20.0,
+        foreign_formats.IMAGE_WIDTH_PX,
+        foreign_formats.IMAGE_HEIGHT_PX,
+        4000.0,
+    )
     text.intrinsics = o3d.camera.PinholeCameraIntrinsic(
-        foreign_formats.WIDTH, foreign_formats.HEIGHT, 14.0, 15.0, 7.5, 5.25
+        foreign_formats.IMAGE_WIDTH_PX, foreign_formats.IMAGE_HEIGHT_PX, 14.0, 15.0, 7.5, 5.25
     )
     (truth.path / "intrinsic.json").write_text(repr(text))
     camera = formats.read(truth.path, scene=truth.write_scene()).cameras["cam0"]
@@ -202,7 +209,7 @@ def test_masks_without_depth_keep_their_times(copy, tmp_path):
 
 @pytest.mark.parametrize("name", ["run #3", "a?b", "50%25"])
 def test_a_sqlite_bag_whose_path_is_another_in_a_uri(tmp_path, name):
-    truth = foreign_formats.ros2(tmp_path / "plain", "sqlite3")
+    truth = foreign_formats.write_ros2(tmp_path / "plain", "sqlite3")
     truth.path = truth.path.rename(tmp_path / name)
     truth.write_scene()
     before = sorted(tmp_path.iterdir())
@@ -239,7 +246,7 @@ def test_a_moving_camera(copy, name, file):
 
 def test_tum_may_track_the_hand(copy):
     truth = copy("tum")
-    truth.scene["cameras"]["cam0"]["T_world_camera"] = foreign_formats.POSE
+    truth.scene["cameras"]["cam0"]["T_world_camera"] = foreign_formats.CAMERA_POSE
     truth.scene["source"] = {"trajectory": "hand"}
     refuse(truth, "source.closed is unclear; expected true or false")
     truth.scene["source"]["closed"] = True
@@ -338,7 +345,7 @@ def test_lerobot_episodes(copy):
     refuse(truth, "holds 2 episodes; got --episode 2", episode=2)
     first = formats.read(truth.path, scene=truth.write_scene(), episode=0)
     assert len(first.joints["left"].t) == len(first.cameras["cam0"].color) == 6
-    assert abs(int(first.cameras["cam0"].color.load(0).mean()) - foreign_formats.lerobot_truth.grey(0, 0)) <= 2
+    assert abs(int(first.cameras["cam0"].color.load(0).mean()) - foreign_formats.lerobot_truth.grey_level(0, 0)) <= 2
 
 
 def test_lerobot_units_are_asked_for(copy):
@@ -394,7 +401,7 @@ def test_kinect_calibration(copy):
     truth = copy("kinect")
     recording = formats.read(truth.path, scene=truth.write_scene())
     depth, color = recording.cameras["depth"], recording.cameras["color"]
-    factory = foreign_formats.FACTORY
+    factory = foreign_formats.FACTORY_LENS_PARAMETERS
     assert depth.K[0, 0] == pytest.approx(factory[2] * 512)
     assert depth.K[0, 2] == pytest.approx(factory[0] * 512 - 96 - 0.5)
     assert depth.K[1, 2] == pytest.approx(factory[1] * 512 - 90 - 0.5)
@@ -403,7 +410,7 @@ def test_kinect_calibration(copy):
     assert depth.depth_scale == 0.001
     assert color.K[1, 2] == pytest.approx(0.5 * 960 - 120 - 0.5)
     in_depth = np.array([0.1, 0.2, 1.5, 1.0])
-    c, s = np.cos(foreign_formats.TILT), np.sin(foreign_formats.TILT)
+    c, s = np.cos(foreign_formats.DEPTH_CAMERA_TILT_RAD), np.sin(foreign_formats.DEPTH_CAMERA_TILT_RAD)
     in_color = np.array([[1, 0, 0, -0.032], [0, c, -s, -0.002], [0, s, c, 0.004], [0, 0, 0, 1]]) @ in_depth
     np.testing.assert_allclose(depth.T_world_camera @ in_depth, color.T_world_camera @ in_color, atol=1e-12)
 
@@ -413,7 +420,7 @@ def test_two_lenses_are_two_cameras(copy):
     truth.scene["source"] = {"depth": "top", "color": "top"}
     refuse(truth, "gives both lenses one name; got top")
     truth.scene["source"] = {"depth": "top", "color": "top_color"}
-    truth.scene["cameras"] = {"top": {"T_world_camera": foreign_formats.POSE}}
+    truth.scene["cameras"] = {"top": {"T_world_camera": foreign_formats.CAMERA_POSE}}
     assert formats.read(truth.path, scene=truth.write_scene()).cameras.keys() == {"top", "top_color"}
 
 

@@ -70,11 +70,11 @@ def test_times_that_no_stamp_holds_are_refused_without_a_trace(recording, tmp_pa
 
 
 def test_an_imported_bag_keeps_its_absolute_times(tmp_path):
-    truth = foreign_formats.ros2(tmp_path)
+    truth = foreign_formats.write_ros2(tmp_path)
     imported = formats.read(truth.path, scene=truth.write_scene())
     file = formats.write_mcap(imported, tmp_path / "again.mcap")
     back = formats.read(file)
-    assert back.extra["source"]["start_ns"] == foreign_formats.EPOCH
+    assert back.extra["source"]["start_ns"] == foreign_formats.FIRST_STAMP_NS
     assert back.extra["source"]["origin"] == imported.extra["source"]
     np.testing.assert_array_equal(back.points.xyz, imported.points.xyz)
     np.testing.assert_array_equal(back.grippers["left"].t, imported.grippers["left"].t)
@@ -102,9 +102,11 @@ def test_rosbags_itself_reads_the_standard_messages(recording, tmp_path):
 @pytest.mark.parametrize(("name", "cover"), [("chunk_crcs", "messages"), ("all_crcs", "all bytes")])
 def test_a_file_of_the_mcap_project_is_read(tmp_path, name, cover):
     file = Path(shutil.copy(FOXGLOVE / f"{name}.mcap", tmp_path))
-    scene = {**foreign_formats.KNOWN, "source": {"motion": {"hand": {"pose": "/hand", "closed": True}}}}
-    recording = formats.read(file, scene=foreign_formats.Foreign(file, scene).write_scene())
-    np.testing.assert_array_equal(recording.grippers["hand"].position, [mcap_truth.position(i) for i in range(5)])
+    scene = {**foreign_formats.SCENE_DESCRIPTION, "source": {"motion": {"hand": {"pose": "/hand", "closed": True}}}}
+    recording = formats.read(file, scene=foreign_formats.ForeignRecording(file, scene).write_scene())
+    np.testing.assert_array_equal(
+        recording.grippers["hand"].position, [mcap_truth.gripper_position(i) for i in range(5)]
+    )
     np.testing.assert_array_equal(recording.grippers["hand"].t, np.arange(5) / 50)
     assert recording.extra["source"]["checksums"] == cover
 

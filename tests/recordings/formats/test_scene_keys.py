@@ -34,7 +34,7 @@ WRONG = {
 
 @pytest.fixture(scope="module")
 def tum(tmp_path_factory):
-    return foreign_formats.tum(tmp_path_factory.mktemp("tum"))
+    return foreign_formats.write_tum(tmp_path_factory.mktemp("tum"))
 
 
 def scene(folder: Path, values: dict) -> Path:
