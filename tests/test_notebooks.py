@@ -42,7 +42,7 @@ def test_it_runs(path, tmp_path, monkeypatch):
 
     monkeypatch.setenv("OMP_NUM_THREADS", "1")
     monkeypatch.setenv("MPLBACKEND", "module://matplotlib_inline.backend_inline")
-    monkeypatch.setenv("PYTHONWARNINGS", "default")
+    monkeypatch.setenv("PYTHONWARNINGS", "ignore::DeprecationWarning")  # as in a reader's session
     notebook = nbformat.read(path, as_version=4)
     probe = nbformat.v4.new_code_cell("import sys; print(sys.executable)")
     notebook.cells.append(probe)
