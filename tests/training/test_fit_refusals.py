@@ -65,7 +65,10 @@ LESS = "{in_features: -2, out_features: 1}"
             "config: learn.network; got a network without any; expected some parameter that may change",
         ),
         (
-            ["learn.network={module: helpers.user_networks.BatchNormNetwork, outputs: [poisson_ratio]}", "run.processes=2"],
+            [
+                "learn.network={module: helpers.user_networks.BatchNormNetwork, outputs: [poisson_ratio]}",
+                "run.processes=2",
+            ],
             "config: learn.network; got layers with running statistics, on several processes",
         ),
         (["out=~nosuchuser/x"], "config: out; got ~nosuchuser/x"),
