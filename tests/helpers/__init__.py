@@ -1,1 +1,1 @@
-"""What tests of several rooms share; pytest finds it by ``pythonpath`` in pyproject.toml."""
+"""Helpers that several test folders share. pytest finds them by ``pythonpath`` in pyproject.toml."""

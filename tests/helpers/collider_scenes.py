@@ -1,4 +1,4 @@
-"""What the tests of solid bodies share."""
+"""Scenes for the tests of colliders."""
 
 import math
 
@@ -19,7 +19,7 @@ def make_sheet(
 
 
 def make_trajectory(t, position, rotation=None):
-    """A trajectory from positions [K, 3] and rotations [K, 3, 3]."""
+    """Return a trajectory from positions [K, 3] and rotations [K, 3, 3]."""
     t = torch.as_tensor(t)
     pose = torch.eye(4).repeat(len(t), 1, 1)
     pose[:, :3, 3] = torch.as_tensor(position)
@@ -34,7 +34,7 @@ def rotate_about_z(angle):
 
 
 def make_box_mesh(size, centre):
-    """A box as a triangle mesh."""
+    """Return vertices and faces of a box."""
     corners = np.array([[i, j, k] for i in (-0.5, 0.5) for j in (-0.5, 0.5) for k in (-0.5, 0.5)])
     faces = [[0, 1, 3], [0, 3, 2], [4, 6, 7], [4, 7, 5], [0, 4, 5], [0, 5, 1]]
     faces += [[2, 3, 7], [2, 7, 6], [0, 2, 6], [0, 6, 4], [1, 5, 7], [1, 7, 3]]
@@ -48,7 +48,7 @@ def translate_along_z(z):
 
 
 def simulate_sliding(body, angle, direction=(1.0, 0.0), start=0.0, time=0.3):
-    """(displacement [V, 3] m, final velocity [V, 3]) of a sheet on a body at z = 0 under tilted gravity."""
+    """Return displacement [V, 3] m and final velocity [V, 3] m/s of a sheet on a body at z = 0 under tilted gravity."""
     a, b = direction
     cloth = make_sheet(
         {"body": body},

@@ -1,6 +1,6 @@
-"""Stands in for a CUDA device: the same source by the C++ compiler, a block's threads one after another.
+"""A replacement of the CUDA device: the C++ compiler builds the same source, and a block's threads run in turn.
 
-Memory is the processor's, so programs run on tensors of the CPU.
+Programs run on CPU tensors.
 """
 
 import ctypes
@@ -89,13 +89,13 @@ extern "C" void launch_adjoint(int blocks, Port* p, R* d, int* t, R* w, unsigned
     each(blocks, [&] { adjoint(p, d, t, w, masks, grids, substeps, first, all); });
 }
 """
-BUILD_FOLDER: list[Path] = []  # the folder of what is compiled, for all processes that run tests
+BUILD_FOLDER: list[Path] = []  # one folder of compiled programs, for all processes that run tests
 COMPILER_FLAGS = ["-std=c++20", "-O1", "-ffp-contract=off", "-fPIC", "-shared", "-pthread", "-w"]
 
 
 @cache
 def compile_program(text):
-    """Each once in a run of the tests: compilers take a second."""
+    """Compile a program once per run of the tests: a compilation takes a second."""
     library = BUILD_FOLDER[0] / f"{hashlib.sha256(text.encode()).hexdigest()}.so"
     if not library.exists():
         with tempfile.TemporaryDirectory(dir=BUILD_FOLDER[0]) as folder:
@@ -107,7 +107,7 @@ def compile_program(text):
 
 
 class HostProgram:
-    """A text, compiled here."""
+    """A program that the host's compiler built."""
 
     def __init__(self, text, threads, reverse):
         self.threads = threads
@@ -122,7 +122,7 @@ class HostProgram:
 
 @contextmanager
 def replace_device_by_host(threads=1, reverse=False):
-    """Programs for the CPU are compiled for it."""
+    """Run CUDA programs on the host within this context."""
     with (
         patch.object(runs, "kernels", lambda text, device: HostProgram(text, threads, reverse)),
         patch.object(runs, "_device_programs", WeakKeyDictionary()),
@@ -130,13 +130,13 @@ def replace_device_by_host(threads=1, reverse=False):
         yield
 
 
-CHECKED_KERNELS: set[str] = set()  # kernels, in this process
+CHECKED_KERNELS: set[str] = set()  # in this process
 
 
-def check_device_agreement(cloth, motion, state, substeps=60, dt=1e-4, stages=0, marks=(1e-11, 1e-9)):
-    """Values and adjoints of a program on a device, or here, and by the processor's own engine, in float64.
+def check_device_agreement(cloth, motion, state, substeps=60, dt=1e-4, stages=0, tolerances=(1e-11, 1e-9)):
+    """Check values and adjoints of a program on a device, or on the host, against the CPU engine in float64.
 
-    Compilers take a while: only where there is a kernel that was not looked at yet.
+    Compilation takes long, so programs without a kernel that is new here are skipped.
     """
     model = cloth.build_model()._replace(stages=stages)
     prescribed = {
@@ -152,16 +152,21 @@ def check_device_agreement(cloth, motion, state, substeps=60, dt=1e-4, stages=0,
     job = job._replace(inputs={f: t.detach().contiguous() for f, t in job.inputs.items()})
     ends = (substeps // 3, substeps)
     if model.grid is not None:
-        ends = (substeps,)  # what goes on in contact is no frame
-    known, _ = execution.forward(job._replace(frame_ends=ends))
+        ends = (substeps,)  # a frame within contact would differ
+    expected, _ = execution.forward(job._replace(frame_ends=ends))
     generator = torch.Generator().manual_seed(0)
-    seeds = {f: torch.randn(job.scenes, f.rows, f.comps, generator=generator, dtype=job.like.dtype) for f in known}
-    before = execution.reverse(job, execution.forward(job, 1)[1], 1, seeds, set(job.inputs))
+    seeds = {f: torch.randn(job.scenes, f.rows, f.comps, generator=generator, dtype=job.like.dtype) for f in expected}
+    expected_gradients = execution.reverse(job, execution.forward(job, 1)[1], 1, seeds, set(job.inputs))
     device = "cuda" if torch.cuda.is_available() else "cpu"
     with replace_device_by_host() if device == "cpu" else nullcontext():
-        there = job._replace(inputs={f: t.to(device) for f, t in job.inputs.items()})
-        results, masks = runs.forward(there._replace(frame_ends=ends))
-        after = runs.reverse(there, masks, {f: t.to(device) for f, t in seeds.items()}, set(job.inputs))
-    for one, other, mark in ((known, results, marks[0]), (before, after, marks[1])):
-        for f, t in one.items():
-            torch.testing.assert_close(other[f].cpu(), t, rtol=0, atol=mark * float(t.abs().max()) + 1e-300, msg=str(f))
+        device_job = job._replace(inputs={f: t.to(device) for f, t in job.inputs.items()})
+        results, masks = runs.forward(device_job._replace(frame_ends=ends))
+        gradients = runs.reverse(device_job, masks, {f: t.to(device) for f, t in seeds.items()}, set(job.inputs))
+    for reference, result, tolerance in (
+        (expected, results, tolerances[0]),
+        (expected_gradients, gradients, tolerances[1]),
+    ):
+        for f, t in reference.items():
+            torch.testing.assert_close(
+                result[f].cpu(), t, rtol=0, atol=tolerance * float(t.abs().max()) + 1e-300, msg=str(f)
+            )

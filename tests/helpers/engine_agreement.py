@@ -1,9 +1,9 @@
 """The fused engine against the torch reference: values, memory, impulses, all gradients, and tangents.
 
-    agree(cloth, motion, state)
+    check_agreement(cloth, motion, state)
 
-runs both from the same state, which should be bent, strained, moving and have a memory of its own (``moving``), with
-the parameters at values that are all different, so that no branch and no sign can hide.
+runs both from the same state. It should be bent, strained and moving, with memory (``make_moving_state``), and all
+parameters should differ, so that the comparison reaches every branch and sign.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ VALUE_TOLERANCE, GRADIENT_TOLERANCE = 1e-10, 1e-8  # relative, in float64
 
 
 class Outcome(NamedTuple):
-    """By name: what came out, and the gradients of a random function of it."""
+    """Results by name, and gradients of a random function of them."""
 
     values: dict[str, Tensor]
     gradients: dict[str, Tensor | None]
@@ -41,14 +41,14 @@ def check_agreement(
     state: ClothState,
     substeps: int = 100,
     dt: float = 1e-4,
-    marks: tuple[float, float] = (VALUE_TOLERANCE, GRADIENT_TOLERANCE),
+    tolerances: tuple[float, float] = (VALUE_TOLERANCE, GRADIENT_TOLERANCE),
     stages: int = 0,
 ) -> dict[str, float]:
-    """Demand agreement; the largest differences by name are returned for reports."""
+    """Check that both engines agree, and return the largest relative differences by name."""
     reference = compute_outcome(roll_out_in_segments, cloth, motion, state, substeps, dt, stages)
     engine = compute_outcome(fused.rollout, cloth, motion, state, substeps, dt, stages)
     results = {name: relative_difference(engine.values[name], value) for name, value in reference.values.items()}
-    worse = {name: value for name, value in results.items() if not value <= marks[0]}
+    worse = {name: value for name, value in results.items() if not value <= tolerances[0]}
     assert set(engine.values) == set(reference.values)
     assert not worse, worse
     for name, value in reference.gradients.items():
@@ -56,25 +56,25 @@ def check_agreement(
         assert (value is None) == (other is None), f"only one engine has a gradient of {name}"
         if value is not None and other is not None:
             results[f"d/d {name}"] = relative_difference(other, value)
-    worse = {name: value for name, value in results.items() if not value <= marks[1]}
+    worse = {name: value for name, value in results.items() if not value <= tolerances[1]}
     assert not worse, worse
     check_graph_capture(cloth, motion, state, dt, stages)
     check_device_agreement(cloth, motion, state, dt=dt, stages=stages)
     results["tangents"] = tangent_adjoint_error(cloth, motion, state, substeps, dt, stages)
-    assert results["tangents"] <= marks[1], results["tangents"]
+    assert results["tangents"] <= tolerances[1], results["tangents"]
     if not stages:
         results["layer"] = sensitivity_adjoint_error(cloth, motion, state, substeps, dt)
-        assert results["layer"] <= marks[1], results["layer"]
+        assert results["layer"] <= tolerances[1], results["layer"]
     return results
 
 
 def check_graph_capture(
     cloth: tc.Cloth, motion: Mapping[str, Trajectory], state: ClothState, dt: float, stages: int
 ) -> None:
-    """A unit of the reference's substeps and its gradients on a device whose tensors have no numbers.
+    """Check that substeps of the reference and their gradients can be captured as a CUDA graph.
 
-    So nothing waits for a number; and nothing is made elsewhere and brought there: it can be captured as a CUDA graph.
-    Where layers meet none is: here none do.
+    They run on the meta device, whose tensors have no values: an operation that waits for a value or makes a tensor
+    on another device raises. Layers must not touch: contact is not captured.
     """
     prescribed = {
         name: PrescribedMotion(d.increment.to("meta"), d.pose.to("meta"), d.closed)
@@ -95,20 +95,20 @@ def check_graph_capture(
 
 
 def capture_on_one_device(work: cuda_graphs.Work, device: torch.device) -> tuple[list[Tensor], cuda_graphs.Replay]:
-    """As a graph that is captured from tensors without numbers, which refuses what others it would have to wait for."""
+    """Run the work once, as the capture of a graph, and refuse operations that leave the device."""
     with OnOneDevice(device.type):
         return work(), lambda: None
 
 
 class OnOneDevice(TorchDispatchMode):
-    """Refuses operations that give a tensor elsewhere."""
+    """Refuses operations that return a tensor on another device."""
 
     def __init__(self, device: str) -> None:
         super().__init__()
         self.device = device
 
     def __torch_dispatch__(self, func, types, args=(), kwargs=None):
-        """Each of them."""
+        """Run an operation and check the devices of its results."""
         out = func(*args, **(kwargs or {}))
         for tensor in out if isinstance(out, (tuple, list)) else [out]:
             if isinstance(tensor, Tensor) and tensor.device.type != self.device:
@@ -119,13 +119,13 @@ class OnOneDevice(TorchDispatchMode):
 def sensitivity_adjoint_error(
     cloth: tc.Cloth, motion: Mapping[str, Trajectory], state: ClothState, substeps: int, dt: float
 ) -> float:
-    """``Cloth.sensitivities`` along changes of all parameters against gradients: the largest relative difference."""
+    """Return the largest relative difference between ``Cloth.sensitivities`` and gradients, along random changes."""
     cloth.zero_grad()
     generator, limit = torch.Generator().manual_seed(2), dt * (1 + 1e-9)
     named, times = dict(cloth.named_parameters()), (0.0, substeps * dt)
     along = {name: torch.randn(3, *p.shape, generator=generator, dtype=p.dtype) for name, p in named.items()}
     for change in along.values():
-        change[1] = 0.0  # nothing changes along one of them
+        change[1] = 0.0  # one direction without any change
     out = cloth(state, motion, times, dt=limit)
     weight = torch.randn(out.x.shape, generator=generator, dtype=out.x.dtype)
     (weight * out.x).sum().backward()
@@ -137,7 +137,7 @@ def sensitivity_adjoint_error(
 
 
 def roll_out_in_segments(model, state, dt, prescribed, substeps):
-    """``functional.rollout`` as ``Cloth`` calls it: near layers are searched again at the start of each call."""
+    """Simulate by ``substep.rollout`` as ``Cloth`` does: contact candidates are searched at the start of each call."""
     total = {}
     for first in range(0, substeps, SUBSTEPS_PER_CHECKPOINT):
         state, results = substep.rollout(
@@ -148,7 +148,7 @@ def roll_out_in_segments(model, state, dt, prescribed, substeps):
 
 
 def compute_outcome(rollout, cloth, motion, state: ClothState, substeps: int, dt: float, stages: int = 0) -> Outcome:
-    """Of one of the engines."""
+    """Return results and gradients of one engine."""
     cloth.zero_grad()
     leaf = state.map(lambda t: t.clone().requires_grad_())
     poses = {name: trajectory.pose.clone().requires_grad_() for name, trajectory in motion.items()}
@@ -171,7 +171,7 @@ def compute_outcome(rollout, cloth, motion, state: ClothState, substeps: int, dt
 
 
 def sample_motion(motion: Mapping[str, Trajectory], substeps: int, dt: float, poses: Mapping[str, Tensor]):
-    """The trajectories on the substeps, with these poses."""
+    """Return the trajectories sampled on the substeps, with these poses."""
     times = torch.linspace(0, substeps * dt, substeps + 1, dtype=torch.float64)
     return {
         name: sample_trajectory(trajectory._replace(pose=poses[name]), times) for name, trajectory in motion.items()
@@ -179,7 +179,7 @@ def sample_motion(motion: Mapping[str, Trajectory], substeps: int, dt: float, po
 
 
 def random_scalar(values: Mapping[str, Tensor]) -> Tensor:
-    """A number in which all count, whatever their units: every component over its size, times random weights."""
+    """Return a random function of all values: each component over its size, times random weights."""
     total = torch.zeros(())
     for seed, value in enumerate(values.values()):
         size = _columns(value.detach()).norm(dim=0).clamp(min=1e-12)
@@ -188,7 +188,7 @@ def random_scalar(values: Mapping[str, Tensor]) -> Tensor:
 
 
 def relative_difference(value: Tensor, reference: Tensor) -> float:
-    """The largest of the components' relative errors; a component that is 0 in the reference must be 0."""
+    """Return the largest relative error of a component; one that is 0 in the reference must be 0."""
     if value.shape != reference.shape or not bool(torch.isfinite(value).all()):
         return float("inf")
     value, reference = value.detach(), reference.detach()
@@ -203,7 +203,7 @@ def _columns(value: Tensor) -> Tensor:
 def tangent_adjoint_error(
     cloth, motion, state: ClothState, substeps: int, dt: float, stages: int, directions=9
 ) -> float:
-    """Relative error of <seed, J dot> = <J^T seed, dot> of the engine, for random dots of all inputs."""
+    """Return the relative error of <seed, J dot> = <J^T seed, dot> of the engine, for random tangents of all inputs."""
     with torch.no_grad():
         prescribed = sample_motion(motion, substeps, dt, {name: t.pose for name, t in motion.items()})
         engine = fused.FusedEngine(cloth.build_model()._replace(stages=stages), state, prescribed)
@@ -221,12 +221,12 @@ def tangent_adjoint_error(
 
 
 def scale_seeds(seed: Tensor, value: Tensor) -> Tensor:
-    """Seeds per size of what they multiply."""
+    """Return seeds over the size of the values that they multiply."""
     return seed / value.abs().mean(1, keepdim=True).clamp(min=1e-12)
 
 
 def draw_scaled_tangents(field, job, gradient: Tensor, directions: int) -> Tensor:
-    """Random directions that all matter equally: [scenes, directions, rows, comps] over the gradient's size."""
+    """Return random tangents [scenes, directions, rows, comps] over the gradient's size, so that all inputs count."""
     dots = draw_noise((len(gradient), directions, *gradient.shape[1:]), field.id, gradient.dtype)
     if len(job.inputs[field]) == 1:
         dots = dots[:1].expand_as(dots)
@@ -234,11 +234,11 @@ def draw_scaled_tangents(field, job, gradient: Tensor, directions: int) -> Tenso
     return (dots / size if float(size) > 0 else dots).contiguous()
 
 
-# -- states in which something happens ----------------------------------------------------------------------------
+# -- moving states ----------------------------------------------------------------------------
 
 
 def make_moving_state(cloth: tc.Cloth, scenes: tuple[int, ...] = (), strain: float = 0.03, seed: int = 0) -> ClothState:
-    """Bent to curves of both signs, turned, strained and sheared, creased and moving; memory as yet virgin."""
+    """Return a state with curvature of both signs: rotated, strained, sheared, creased and moving."""
     rest = cloth.rest_state().x
     size = (rest.amax(0) - rest.amin(0)).max()
     u, w = (2 * torch.pi * (rest[:, :2] - rest.amin(0)[:2]) / size).unbind(-1)
@@ -252,7 +252,7 @@ def make_moving_state(cloth: tc.Cloth, scenes: tuple[int, ...] = (), strain: flo
 
 
 def make_moving_hand(cloth_time: float, knots: int = 3, scenes: tuple[int, ...] = ()) -> Trajectory:
-    """A hand that moves and turns."""
+    """Return the trajectory of a hand that moves and turns."""
     pose = torch.eye(4).repeat(*scenes, knots, 1, 1)
     angle = torch.linspace(0, 0.1, knots)
     pose[..., 0, 0], pose[..., 0, 1] = angle.cos(), -angle.sin()
@@ -263,5 +263,5 @@ def make_moving_hand(cloth_time: float, knots: int = 3, scenes: tuple[int, ...] 
 
 
 def draw_noise(shape, seed: int, dtype: torch.dtype = torch.float64) -> Tensor:
-    """Standard normal numbers that do not depend on the global generator."""
+    """Return standard normal numbers that do not depend on the global generator."""
     return torch.randn(tuple(shape), generator=torch.Generator().manual_seed(seed), dtype=torch.float64).to(dtype)

@@ -1,4 +1,4 @@
-"""Cloths that the tests of the engine share."""
+"""Cloths and motions for tests of the engine."""
 
 import torch
 
@@ -6,7 +6,7 @@ import torchcloth as tc
 
 
 def make_sheet(engine="auto", *, effects=None, boundaries=None, material=None, n=5, **options):
-    """A small sheet with weight, drag, bending and two hands."""
+    """Return a small sheet with weight, drag, bending and two grasps."""
     mesh = tc.meshes.rectangle(0.2, 0.2, resolution=(n, n))
     if effects is None:
         effects = {
@@ -22,7 +22,7 @@ def make_sheet(engine="auto", *, effects=None, boundaries=None, material=None, n
 
 
 def make_opening_motion(end, name_of_flags="left"):
-    """Two hands that travel; one lets go and takes hold again between the frames."""
+    """Return two moving grippers; one opens and closes again between the frames."""
     t = torch.linspace(0.0, end, 7)
     motion = {}
     for sign, name in ((1, "left"), (-1, "right")):
@@ -37,7 +37,7 @@ def make_opening_motion(end, name_of_flags="left"):
 
 
 def make_perturbed_state(cloth, batch=()):
-    """Not at rest, not flat."""
+    """Return a state with random displacements and velocities."""
     generator = torch.Generator().manual_seed(0)
     x = cloth.rest_state().x.expand(*batch, -1, -1)
     x = x + 1e-3 * torch.randn(x.shape, generator=generator, dtype=torch.float64).to(x)
@@ -45,7 +45,7 @@ def make_perturbed_state(cloth, batch=()):
     return cloth.state(x, v)
 
 
-def check_close(a, b, mark, what):
-    """Relative in the norm."""
+def check_close(a, b, tolerance, what):
+    """Check that the relative error in the norm is small."""
     error = float((a - b).detach().norm() / b.detach().norm().clamp(min=1e-300))
-    assert error < mark, f"{what}: {error:.2e}"
+    assert error < tolerance, f"{what}: {error:.2e}"

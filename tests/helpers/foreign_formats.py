@@ -1,4 +1,4 @@
-"""Tiny recordings in other formats, written by the libraries of those formats, with the truth beside them."""
+"""Tiny recordings in other formats, written by the libraries of those formats, with their true content."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ CAMERA_POSE = [[0.0, 1.0, 0.0, 0.5], [1.0, 0.0, 0.0, 0.1], [0.0, 0.0, -1.0, 1.5]
 CLOTH_DESCRIPTION = {"sheet": {"width": 0.3, "height": 0.2}, "areal_density": 0.15, "thickness": 5e-4}
 SCENE_DESCRIPTION = {"cloth": CLOTH_DESCRIPTION, "provenance": "measured"}
 IMAGE_WIDTH_PX, IMAGE_HEIGHT_PX, FRAME_COUNT = 16, 12, 3
-FIRST_STAMP_NS = 1_700_000_000_123_456_789  # ns; not a multiple of what float64 seconds can tell apart
+FIRST_STAMP_NS = 1_700_000_000_123_456_789  # not a multiple of the resolution of float64 seconds
 
 
 @dataclass
 class ForeignRecording:
-    """A recording on disk, the scene that completes it, and what must be read."""
+    """A recording on disk, the scene description that completes it, and the expected content."""
 
     path: Path
     scene: dict
@@ -39,7 +39,7 @@ class ForeignRecording:
 
 
 def draw_images(seed: int = 0) -> tuple[list[np.ndarray], list[np.ndarray]]:
-    """Depth [mm, 1 to 2 m, some invalid] and colour images."""
+    """Return depth [mm, 1 to 2 m, some invalid] and colour images."""
     rng = np.random.default_rng(seed)
     depth = [rng.integers(1000, 2000, (IMAGE_HEIGHT_PX, IMAGE_WIDTH_PX)).astype(np.uint16) for _ in range(FRAME_COUNT)]
     depth[0][0, :3] = 0
@@ -65,7 +65,7 @@ def decode_image(data: bytes) -> np.ndarray:
 
 
 def write_redwood(folder: Path) -> ForeignRecording:
-    """By open3d.io."""
+    """Write a Redwood folder by open3d.io."""
     import open3d as o3d
 
     root, (depth, color) = folder / "redwood", draw_images()
@@ -84,15 +84,15 @@ def write_redwood(folder: Path) -> ForeignRecording:
     trajectory.parameters = [one] * FRAME_COUNT
     o3d.io.write_pinhole_camera_trajectory(str(root / "trajectory.log"), trajectory)
     times = [(us - stamps[0]) / 1e6 for us in stamps]
-    both = {"cam0/depth": depth, "cam0/color": color}
-    return ForeignRecording(root, dict(SCENE_DESCRIPTION), both, dict.fromkeys(both, times))
+    images = {"cam0/depth": depth, "cam0/color": color}
+    return ForeignRecording(root, dict(SCENE_DESCRIPTION), images, dict.fromkeys(images, times))
 
 
 INTRINSICS_PX = [[14.0, 0.0, 7.5], [0.0, 15.0, 5.25], [0.0, 0.0, 1.0]]
 
 
 def write_tum(folder: Path) -> ForeignRecording:
-    """In the published layout; colour comes 12 ms after depth, and once more at the end."""
+    """Write a TUM folder; colour comes 12 ms after depth, with one more image at the end."""
     root, (depth, color) = folder / "tum", draw_images(1)
     color.append(color[0][::-1].copy())
     names = {"depth": ("depth", depth, 0), "rgb": ("color", color, 12_000)}
@@ -118,8 +118,8 @@ def write_tum(folder: Path) -> ForeignRecording:
     return ForeignRecording(root, scene, {"cam0/depth": depth, "cam0/color": color}, times)
 
 
-def write_ros2(folder: Path, storage: str = "mcap", *, seal: bool = False) -> ForeignRecording:
-    """By rosbags' writer, in the standard messages of ROS 2."""
+def write_ros2(folder: Path, storage: str = "mcap", *, checksums: bool = False) -> ForeignRecording:
+    """Write a bag by rosbags' writer, in standard messages of ROS 2; ``checksums``: add those of MCAP."""
     from rosbags.rosbag2 import StoragePlugin, Writer
     from rosbags.typesys import Stores, get_typestore
 
@@ -134,8 +134,10 @@ def write_ros2(folder: Path, storage: str = "mcap", *, seal: bool = False) -> Fo
     quat /= np.linalg.norm(quat, axis=1, keepdims=True)
     q, width, force = rng.normal(size=(n, 7)), np.linspace(0.04, 0.0, n), rng.normal(size=(n, 6))
     clouds = [rng.normal(0, 0.2, (k, 3)).astype(np.float32) for k in (7, 4)]
-    make = lambda kind, *values: store.types[kind](*values)  # noqa: E731
     std, sensor, geometry = "std_msgs/msg/", "sensor_msgs/msg/", "geometry_msgs/msg/"
+
+    def make(kind: str, *values):
+        return store.types[kind](*values)
 
     def header(ns: int, frame: str = "world"):
         return make(std + "Header", make("builtin_interfaces/msg/Time", *divmod(ns, 10**9)), frame)
@@ -192,8 +194,8 @@ def write_ros2(folder: Path, storage: str = "mcap", *, seal: bool = False) -> Fo
             order = np.roll(np.arange(8), i)  # drivers do not promise an order
             state = make(sensor + "JointState", header(ns), [names[k] for k in order], values[order], none, none)
             joints.append((ns, state))
-            both = [make(geometry + "Vector3", *part.tolist()) for part in np.split(force[i], 2)]
-            wrench = make(geometry + "Wrench", *both)
+            vectors = [make(geometry + "Vector3", *part.tolist()) for part in np.split(force[i], 2)]
+            wrench = make(geometry + "Wrench", *vectors)
             wrenches.append((ns, make(geometry + "WrenchStamped", header(ns), wrench)))
             sensed.append((ns, make(geometry + "WrenchStamped", header(ns, "sensor"), wrench)))
         put("/left/pose", geometry + "PoseStamped", poses)
@@ -224,7 +226,7 @@ def write_ros2(folder: Path, storage: str = "mcap", *, seal: bool = False) -> Fo
             kind,
             [(ns, make(kind, header(ns, "lens"), "jpeg", c)) for ns, c in zip(stamps, files, strict=False)],
         )
-    if storage == "mcap" and seal:
+    if storage == "mcap" and checksums:
         mcap_checksums.write_checksums(root / f"{root.name}.mcap")
     joint_map = {"topic": "/joint_states", "names": [f"j{k}" for k in range(7)], "width": "finger"}
     left = {"pose": "/left/pose", "closed": "/closed", "wrench": "/left/ft", "wrench_frame": "world"}
@@ -244,12 +246,12 @@ def write_ros2(folder: Path, storage: str = "mcap", *, seal: bool = False) -> Fo
             },
         },
     }
-    fine = [5 * d for d in depth]  # in units of 0.2 mm
-    fine[0][0, :3] = 0
+    depth_in_fifths = [5 * d for d in depth]  # in units of 0.2 mm
+    depth_in_fifths[0][0, :3] = 0
     images = {
         "cam0/depth": depth,
         "cam0/color": color,
-        "cam1/depth": fine,
+        "cam1/depth": depth_in_fifths,
         "cam1/color": [decode_image(c) for c in compressed],
     }
     arrays = {
@@ -266,7 +268,7 @@ def write_ros2(folder: Path, storage: str = "mcap", *, seal: bool = False) -> Fo
 
 
 def copy_lerobot(folder: Path) -> ForeignRecording:
-    """A copy of the data set that lerobot itself wrote, second episode."""
+    """Copy the data set that lerobot itself wrote; expect its second episode."""
     import shutil
 
     root = Path(shutil.copytree(lerobot_truth.LEROBOT_FOLDER / "dataset", folder / "lerobot"))
@@ -309,11 +311,11 @@ FACTORY_LENS_PARAMETERS = [
     1.24e-4,
     5.9e-6,
 ]
-DEPTH_CAMERA_TILT_RAD = 0.1  # rad, of depth from colour; close to the real 6 degrees
+DEPTH_CAMERA_TILT_RAD = 0.1  # of depth from colour; close to the real 6 degrees
 
 
 def make_calibration() -> dict:
-    """Attached by k4arecorder; the numbers of a real device (k4a issue 1617) for the depth lens."""
+    """Return a calibration as k4arecorder attaches it; the depth lens is that of a real device (k4a issue 1617)."""
     c, s = np.cos(DEPTH_CAMERA_TILT_RAD), np.sin(DEPTH_CAMERA_TILT_RAD)
     turn = [1.0, 0.0, 0.0, 0.0, c, -s, 0.0, s, c]
 
@@ -333,9 +335,9 @@ def make_calibration() -> dict:
 
 
 def write_kinect(folder: Path, *, size: tuple[int, int] = (320, 288), frames: int = FRAME_COUNT) -> ForeignRecording:
-    """By FFmpeg's Matroska writer, with tracks, tags and attachment as k4arecorder leaves them.
+    """Write a file by FFmpeg's Matroska writer, with tracks, tags and attachment as k4arecorder writes them.
 
-    FFmpeg stores raw video without its fourcc; it is put there afterwards, as k4arecorder has it.
+    FFmpeg stores raw video without its fourcc; it is added afterwards, as k4arecorder has it.
     """
     import av
 

@@ -1,4 +1,4 @@
-"""The truth may not come from the code that it judges: imports of a source are read without running it."""
+"""Imports of a source, read without running it: the truth may not come from the code that it tests."""
 
 import ast
 from collections.abc import Sequence

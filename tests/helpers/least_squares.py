@@ -1,4 +1,4 @@
-"""Least-squares problems whose answer is known, in the form that the solver takes. No simulation."""
+"""Least-squares problems with known solutions, in the form that the solver takes. No simulation."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from torch import Tensor
 from torchcloth.identification.estimators.levenberg_marquardt import DEFAULT_NOISE_MODEL, Linearised, Problem, minimise
 
 FRAME_COUNT, PATCH_COUNT, POINTS_PER_PATCH = 40, 16, 3  # rows: 40 frames of 16 patches of 3 points
-SIGMA_M = 1e-3  # m
+SIGMA_M = 1e-3
 TRUE_UNKNOWNS = torch.tensor([0.4, -0.3, 0.7], dtype=torch.float64)
 Model = Callable[[Tensor], Tensor]
 
 
 @dataclass
 class ToyProblem:
-    """``model(raw) - data``, with a log of what the solver asked for."""
+    """The residual ``model(raw) - data``, with a log of the points that the solver evaluates."""
 
     model: Model
     data: Tensor
@@ -32,7 +32,7 @@ class ToyProblem:
     evaluated: list[Tensor] = field(default_factory=list)
 
     def problem(self) -> Problem:
-        """The solver's view."""
+        """Return the problem in the solver's form."""
         mean = torch.zeros(self.unknowns, dtype=torch.float64)
         std = torch.full_like(mean, self.prior_std)
         return Problem(
@@ -60,14 +60,14 @@ class ToyProblem:
 
 
 def row_layout(frames: int = FRAME_COUNT) -> tuple[Tensor, Tensor]:
-    """Frame and patch of every row; frame 0 has none, as in an episode."""
+    """Return frame and patch of every row; frame 0 has none, as in an episode."""
     frame = torch.arange(1, frames + 1).repeat_interleave(PATCH_COUNT * POINTS_PER_PATCH)
     patch = torch.arange(PATCH_COUNT).repeat_interleave(POINTS_PER_PATCH).repeat(frames)
     return frame, patch
 
 
 def draw_jacobian(generator: torch.Generator, frames: int = FRAME_COUNT, unknowns: int = len(TRUE_UNKNOWNS)) -> Tensor:
-    """[R, K] m: smooth over time and equal within a patch, as those of a fabric are."""
+    """Return a Jacobian [R, K] m that is smooth over time and equal within a patch, as that of a fabric."""
     frame, patch = row_layout(frames)
     phase, rate = torch.rand(2, PATCH_COUNT, unknowns, generator=generator, dtype=torch.float64)
     t = frame[:, None] / FRAME_COUNT
@@ -75,9 +75,9 @@ def draw_jacobian(generator: torch.Generator, frames: int = FRAME_COUNT, unknown
 
 
 def draw_noise(generator: torch.Generator, shared: float, frames: int = FRAME_COUNT) -> Tensor:
-    """[R] m: independent, and a part of ``shared`` times its size that a patch keeps over a window of frames.
+    """Return noise [R] m: independent, and ``shared`` times as large a part that is common to a patch and window.
 
-    The windows begin two frames off those that the solver counts in: real errors do not know them.
+    The windows begin two frames after those of the solver, because real errors do not respect them.
     """
     frame, patch = row_layout(frames)
     window = (frame + 2) // DEFAULT_NOISE_MODEL.frames_per_time_block
@@ -87,7 +87,7 @@ def draw_noise(generator: torch.Generator, shared: float, frames: int = FRAME_CO
 
 
 def make_linear_problem(seed: int, shared: float = 0.0) -> tuple[ToyProblem, Tensor]:
-    """A linear problem and its Jacobian."""
+    """Return a linear problem and its Jacobian."""
     generator = torch.Generator().manual_seed(seed)
     jacobian = draw_jacobian(generator)
     return ToyProblem(
@@ -96,10 +96,13 @@ def make_linear_problem(seed: int, shared: float = 0.0) -> tuple[ToyProblem, Ten
 
 
 def make_curved_problem(seed: int = 0, bend: float = 1.0) -> ToyProblem:
-    """Exponentials of the unknowns: a Jacobian that changes by a factor between start and solution."""
+    """Return a problem in exponentials of the unknowns, whose Jacobian changes between start and solution."""
     generator = torch.Generator().manual_seed(seed)
     jacobian = draw_jacobian(generator)
-    model = lambda raw: jacobian @ (torch.expm1(bend * raw) / bend)  # noqa: E731
+
+    def model(raw: Tensor) -> Tensor:
+        return jacobian @ (torch.expm1(bend * raw) / bend)
+
     return ToyProblem(model, model(TRUE_UNKNOWNS) + draw_noise(generator, 0.0), *row_layout())
 
 

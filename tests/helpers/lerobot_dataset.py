@@ -1,7 +1,7 @@
 """Makes the data set in tests/recordings/formats/lerobot by lerobot's own writer (``pip install lerobot==0.4.4``).
 
 Two episodes of 6 and 8 frames, one camera, seven joint angles and a gripper opening as LeRobot stores them. The
-numbers come from the functions below, which the tests call for the truth. Ours; CC0, free of any rights.
+functions below give the values, and tests call them for the truth. Ours; CC0, free of any rights.
 """
 
 from __future__ import annotations
@@ -20,13 +20,13 @@ STATE_NAMES = [*(f"joint_{i}.pos" for i in range(1, 8)), "gripper.width"]
 
 
 def make_state(episode: int, frame: int) -> np.ndarray:
-    """Joint angles [rad] and opening [m] of one frame, [8] float32."""
+    """Return joint angles [rad] and opening [m] of one frame, [8] float32."""
     q = 0.3 * np.sin(0.2 * frame + np.arange(7) + episode)
     return np.append(q, 0.04 - 0.005 * frame).astype(np.float32)
 
 
 def grey_level(episode: int, frame: int) -> int:
-    """The grey level of one picture, which survives a lossy codec."""
+    """Return the grey level of one picture, which survives a lossy codec."""
     return 40 + 90 * episode + 10 * frame
 
 

@@ -1,4 +1,4 @@
-"""Evidence drawn from a linear model with known noise: the statistics can be held against theory, without any cloth."""
+"""Linearisations drawn from a linear model with known noise, to compare statistics with theory without a cloth."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def make_parameter(name: str, std: float = 0.5) -> BaseParameter:
 
 
 def make_cells() -> BinnedResiduals:
-    """One episode's cells without values: a square of 0.3 m in 4 x 4 parts."""
+    """Return the cells of one episode without values: a square of 0.3 m in 4 x 4 patches."""
     patch, window = (
         i.flatten() for i in torch.meshgrid(torch.arange(PATCH_COUNT), torch.arange(WINDOW_COUNT), indexing="ij")
     )
@@ -38,7 +38,7 @@ def make_cells() -> BinnedResiduals:
 
 
 def draw_jacobian(seed: int, columns: int) -> torch.Tensor:
-    """[EPISODES, C, columns] m per unit, slopes that vary over centimetres and tenths of a second."""
+    """Return a Jacobian [EPISODE_COUNT, C, columns] m per unit that varies over centimetres and tenths of a second."""
     rng = torch.Generator().manual_seed(seed)
     cells = make_cells()
     basis = torch.cat([cells.rest_position[:, :2] / 0.3, cells.time[:, None]], 1)
@@ -48,34 +48,39 @@ def draw_jacobian(seed: int, columns: int) -> torch.Tensor:
 
 
 def draw_linearisation(
-    slopes: torch.Tensor, own: int, names: list[str], truth: torch.Tensor, seed: int
+    jacobian: torch.Tensor, parameter_count: int, names: list[str], truth: torch.Tensor, seed: int
 ) -> Linearisation:
-    """Residuals of a world in which ``truth`` [own + names] is what the model lacks; last column: a nuisance."""
+    """Return residuals of a world that differs from the model by ``truth`` [parameter_count + names].
+
+    The last column of the Jacobian belongs to a nuisance.
+    """
     rng = torch.Generator().manual_seed(1000 + seed)
     level = torch.zeros(len(BLOCK_NAMES)).double()
     level[0] = SLOW_ERROR_M
     cells, stds = [], []
-    for own_slopes in slopes:
-        blank = make_cells()._replace(jacobian=own_slopes)
+    for episode_jacobian in jacobian:
+        cell = make_cells()._replace(jacobian=episode_jacobian)
         root = torch.linalg.cholesky(
-            Noise(level).covariance(blank, own_slopes[:, -1:], torch.tensor([NUISANCE_STD_M]).double())
+            Noise(level).covariance(cell, episode_jacobian[:, -1:], torch.tensor([NUISANCE_STD_M]).double())
         )
         noise = root @ torch.randn(len(root), generator=rng).double()
-        cells.append(blank._replace(value=noise - own_slopes[:, :-1] @ truth))
+        cells.append(cell._replace(value=noise - episode_jacobian[:, :-1] @ truth))
         stds.append(torch.tensor([NUISANCE_STD_M]).double())
-    found = [make_hypothesis(name) for name in names]
-    return Linearisation(cells, own, found, stds, [torch.zeros_like(c.value) for c in cells])
+    hypotheses = [make_hypothesis(name) for name in names]
+    return Linearisation(cells, parameter_count, hypotheses, stds, [torch.zeros_like(c.value) for c in cells])
 
 
-def make_model_fit(ev: Linearisation, level: float = SLOW_ERROR_M, std: float = 0.5) -> ModelFit:
-    """As ``fit`` leaves it, at the point where the evidence was gathered."""
+def make_model_fit(linearisation: Linearisation, level: float = SLOW_ERROR_M, std: float = 0.5) -> ModelFit:
+    """Return the fitted model at the point of linearisation, as ``fit`` does."""
     levels = torch.full((len(BLOCK_NAMES),), level).double()
     model = WorldModel(
         None,
-        tuple(make_parameter(f"p{k}", std) for k in range(ev.n_coordinates)),
-        torch.zeros(ev.n_coordinates).double(),
+        tuple(make_parameter(f"p{k}", std) for k in range(linearisation.n_coordinates)),
+        torch.zeros(linearisation.n_coordinates).double(),
     )  # type: ignore[arg-type]
-    white = whiten(ev, Noise(levels))
-    own = white.jacobian[:, : ev.n_coordinates]
-    covariance = torch.linalg.inv(own.mT @ own + torch.eye(ev.n_coordinates).double() / std**2)
-    return ModelFit(model, ev, Noise(levels), white, covariance, 0.0)
+    white = whiten(linearisation, Noise(levels))
+    parameter_jacobian = white.jacobian[:, : linearisation.n_coordinates]
+    covariance = torch.linalg.inv(
+        parameter_jacobian.mT @ parameter_jacobian + torch.eye(linearisation.n_coordinates).double() / std**2
+    )
+    return ModelFit(model, linearisation, Noise(levels), white, covariance, 0.0)

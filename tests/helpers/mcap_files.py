@@ -10,7 +10,7 @@ import io
 from pathlib import Path
 
 MCAP_FOLDER = Path(__file__).parents[1] / "recordings" / "formats" / "mcap"
-FIRST_POSE_NS = 1_700_000_000_000_000_000  # ns
+FIRST_POSE_NS = 1_700_000_000_000_000_000
 
 POSE_MESSAGE_DEFINITION = """std_msgs/Header header
 geometry_msgs/Pose pose
@@ -41,12 +41,12 @@ float64 w
 
 
 def gripper_position(i: int) -> list[float]:
-    """Of the gripper [m] at pose ``i``."""
+    """Return the position [m] of the gripper at pose ``i``."""
     return [0.1 * i, -0.2, 0.3 + 0.01 * i]
 
 
 def write_file(path: Path, *, data_crcs: bool) -> None:
-    """Write one file; checksums of the whole data section are an option of the library, those of chunks are not."""
+    """Write one file, with checksums of its chunks and, if ``data_crcs``, of the data section."""
     from mcap.writer import CompressionType
     from mcap.writer import Writer as McapWriter
     from mcap_ros2.writer import Writer  # pyright: ignore[reportMissingImports]

@@ -1,4 +1,4 @@
-"""Readings of off-axis strips from closed forms, and a cloth far from them."""
+"""Readings of off-axis strips from closed forms, and a cloth with other parameters."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ WARP_MODULUS_PA, WEFT_MODULUS_PA, SHEAR_MODULUS_PA, THICKNESS_M = 15e6, 59e6, 3e
 
 
 def make_start_cloth(**changes) -> tc.Cloth:
-    """Far from the truth."""
+    """Return a cloth whose parameters are far from the truth."""
     law = {
         "youngs_modulus": 4e7,
         "weft_modulus": 2e7,
@@ -25,16 +25,16 @@ def make_start_cloth(**changes) -> tc.Cloth:
     return tc.Cloth(mesh, tc.materials.OrthotropicAEP(**{**law, **changes}), 0.1, contact=None)
 
 
-def make_readings(degrees: float, noise: float, draw: np.random.Generator, count: int = 40) -> ForceDisplacement:
-    """Jones's off-axis modulus at strains up to 0.1 %, with white noise as a share of the largest force."""
+def make_readings(degrees: float, noise: float, rng: np.random.Generator, count: int = 40) -> ForceDisplacement:
+    """Return readings at strains up to 0.1 %, with white noise as a fraction of the largest force."""
     strain = np.linspace(0, 1e-3, count)
     force = off_axis_modulus(degrees) * THICKNESS_M * 0.02 * strain
-    force = force + noise * force.max() * draw.normal(size=count)
+    force = force + noise * force.max() * rng.normal(size=count)
     return ForceDisplacement(length=0.1, width=0.02, angle=radians(degrees), displacement=0.1 * strain, force=force)
 
 
 def off_axis_modulus(degrees: float) -> float:
-    """Pa, Jones."""
+    """Return the off-axis modulus [Pa] of Jones."""
     c, s = cos(radians(degrees)), sin(radians(degrees))
     return 1 / (
         c**4 / WARP_MODULUS_PA

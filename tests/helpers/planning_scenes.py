@@ -1,4 +1,4 @@
-"""Episodes to plan in: a small sheet whose upper edge a free hand holds, or the arm of a Rizon 4."""
+"""Episodes to plan in: the upper edge of a small sheet is in a free gripper, or in that of a Rizon 4."""
 
 from __future__ import annotations
 
@@ -9,9 +9,9 @@ import torchcloth as tc
 from torchcloth import recordings as rec
 from torchcloth.identification import build_cloth
 
-SIDE_M = 0.2  # m
-DURATION_S = 0.4  # s
-UPPER_EDGE_M = np.stack([np.linspace(0.0, SIDE_M, 7), np.full(7, SIDE_M)], axis=-1)  # m
+SIDE_M = 0.2
+DURATION_S = 0.4
+UPPER_EDGE_M = np.stack([np.linspace(0.0, SIDE_M, 7), np.full(7, SIDE_M)], axis=-1)
 NOMINAL_VALUES = {"membrane_stiffness": 50.0, "poisson_ratio": 0.3, "bending_stiffness": 3e-5}
 
 
@@ -28,14 +28,14 @@ def describe_cloth(x: np.ndarray, mesh: tc.meshes.Mesh) -> rec.ClothInfo:
 
 
 def _hang_sheet(corner: np.ndarray) -> tuple[np.ndarray, tc.meshes.Mesh]:
-    """(positions with the upper left corner there, the mesh)."""
+    """Return positions of a vertical sheet with this upper left corner, and its mesh."""
     mesh = tc.meshes.rectangle(SIDE_M, SIDE_M, triangles=72)
     u, v = mesh.uv.T
     return corner + np.stack([0 * u, u, v - SIDE_M], axis=-1), mesh
 
 
 def make_hand_episode(table: float | None = None) -> rec.Recording:
-    """A free hand that moves 3 cm along x, over a table of that height."""
+    """Return the episode of a free gripper that moves 3 cm along x, over a table at height ``table`` [m] if given."""
     t = np.linspace(0.0, DURATION_S, 41)
     x, mesh = _hang_sheet(np.array([0.0, 0.0, 0.5]))
     s = t / DURATION_S
@@ -52,7 +52,7 @@ def make_hand_episode(table: float | None = None) -> rec.Recording:
 
 
 def make_arm_episode() -> rec.Recording:
-    """The arm of a Rizon 4 that turns its first joint by 0.05 rad and back."""
+    """Return the episode of a Rizon 4 that turns its first joint by 0.05 rad and back."""
     arm = tc.robots.load("rizon4", frame="tcp_closed")
     t = torch.linspace(0.0, DURATION_S, 41, dtype=torch.float64)
     q = arm.home.repeat(41, 1)
@@ -70,5 +70,5 @@ def make_arm_episode() -> rec.Recording:
 
 
 def build_nominal_cloth(recording: rec.Recording) -> tc.Cloth:
-    """At the data sheet's values."""
+    """Return the cloth with the values of the data sheet."""
     return build_cloth(recording)

@@ -12,7 +12,15 @@ from torchcloth import recordings as rec
 
 
 def check_equal(a, b, *, atol: float = 0.0, times: float = 0.0, at: str = "recording") -> None:
-    """Compare two bags of arrays field by field; ``atol`` is for points. Paths may differ, image bytes may not."""
+    """Check that two recordings are equal field by field.
+
+    Args:
+        a: a recording or a part of one.
+        b: likewise.
+        atol: m, for points.
+        times: s, tolerance of times.
+        at: name of the part, for messages. Paths may differ, image bytes may not.
+    """
     if is_dataclass(a):
         assert type(a) is type(b), at
         for f in fields(a):

@@ -1,4 +1,4 @@
-"""What a written file has that its JSON Schema does not describe."""
+"""Checks that the JSON Schema of a file describes all of its content."""
 
 import copy
 import re

@@ -1,4 +1,4 @@
-"""Small episodes of a light sheet in two grippers, made by the same engine on another mesh: they test the machinery."""
+"""Small episodes of a light sheet in two grippers, simulated by the library on another mesh."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from torchcloth.episodes.observed import build_episode as tensors
 from torchcloth.episodes.pattern_interpolation import interpolate_on_pattern, interpolation_weights
 from torchcloth.episodes.replay import Frames
 
-SIDE_M = 0.2  # m
+SIDE_M = 0.2
 TRUTH_RESOLUTION, FIT_RESOLUTION = (13, 13), (7, 7)
 NOMINAL_VALUES = {
     "membrane_stiffness": 60.0,
@@ -24,19 +24,19 @@ NOMINAL_VALUES = {
     "bending_stiffness": 2e-4,
     "bending_damping_time": 0.01,
 }
-CAMERA_POSITION_M = (0.1, -1.2, 1.1)  # m, of the camera
+CAMERA_POSITION_M = (0.1, -1.2, 1.1)
 FRAME_COUNT, FRAME_RATE_HZ, POINTS_PER_FRAME, NOISE_M = 16, 20.0, 80, 5e-4  # -, Hz, a frame, m
 
 
 def make_swing(amplitude: float, rate: float, axis: int = 1) -> Callable[[np.ndarray], np.ndarray]:
-    """Displacement [K, 3] m of both grippers."""
+    """Return the displacement [K, 3] m of both grippers as a function of time."""
 
-    def moved(t: np.ndarray) -> np.ndarray:
+    def displacement(t: np.ndarray) -> np.ndarray:
         out = np.zeros((len(t), 3))
         out[:, axis] = 0.5 * amplitude * (1 - np.cos(2 * np.pi * rate * t))
         return out
 
-    return moved
+    return displacement
 
 
 MOTIONS = {"slow": make_swing(0.06, 1.2), "fast": make_swing(0.10, 1.6), "lift": make_swing(0.05, 2.0, axis=2)}
@@ -45,7 +45,7 @@ MOTIONS = {"slow": make_swing(0.06, 1.2), "fast": make_swing(0.10, 1.6), "lift":
 def make_episode(
     motion: str = "slow", resolution: tuple[int, int] = FIT_RESOLUTION, duration: float = 0.3
 ) -> rec.Recording:
-    """Without anything seen of it but points on its first shape."""
+    """Return an episode whose observations are points on the first shape."""
     mesh = tc.meshes.rectangle(SIDE_M, SIDE_M, resolution=resolution)
     t, rng = np.linspace(0.0, duration, 2 + int(50 * duration)), np.random.default_rng(0)
     first = np.c_[mesh.uv[:, 0], 0.01 * np.sin(8 * mesh.uv[:, 0]), mesh.uv[:, 1]] + [0.0, 0.0, 1.0]
@@ -68,7 +68,7 @@ def make_episode(
     )
     return rec.Recording(
         cloth=info,
-        provenance="synthetic: tests/diagnosis/sheets.py",
+        provenance="synthetic: tests/helpers/sheet_episodes.py",
         grasps=grasps,
         grippers=grippers,
         points=rec.PointClouds(np.arange(frames) / FRAME_RATE_HZ, points.reshape(-1, 3), np.full(frames, 40)),
@@ -92,20 +92,20 @@ def record_changed_world(
     seed: int,
     play: Callable[[World, Episode], Frames] = World.simulate_observed,
 ) -> rec.Recording:
-    """What a noisy sensor has of a world that is changed, played on a finer mesh; the first shape is settled."""
-    blank, rng = (
+    """Return the noisy recording of a changed world on a finer mesh; the first shape is settled."""
+    fine_episode, rng = (
         make_episode(motion, TRUTH_RESOLUTION, (FRAME_COUNT - 1) / FRAME_RATE_HZ + 0.01),
         np.random.default_rng(seed),
     )
-    plain = build_base_model(blank).build_world()
-    world, even = change(plain), np.asarray(blank.cloth.uv)
+    base_world = build_base_model(fine_episode).build_world()
+    world, uv = change(base_world), np.asarray(fine_episode.cloth.uv)
     with torch.no_grad():
-        data = tensors(world.cloth, blank)
+        data = tensors(world.cloth, fine_episode)
         state = world.cloth.settle(world.cloth.state(data.initial), data.motion, duration=1.0, rate=15.0)
-        start = interpolate_on_pattern(interpolation_weights(world.cloth.mesh, even), state.x)
-        settled = replace(blank, cloth=replace(blank.cloth, initial_vertices=start.numpy()))
-        found = play(world, tensors(world.cloth, settled))
-        x = interpolate_on_pattern(interpolation_weights(plain.cloth.mesh, even), found.x).numpy()
+        start = interpolate_on_pattern(interpolation_weights(world.cloth.mesh, uv), state.x)
+        settled = replace(fine_episode, cloth=replace(fine_episode.cloth, initial_vertices=start.numpy()))
+        frames = play(world, tensors(world.cloth, settled))
+        x = interpolate_on_pattern(interpolation_weights(base_world.cloth.mesh, uv), frames.x).numpy()
     coarse = make_episode(motion, FIT_RESOLUTION, (FRAME_COUNT - 1) / FRAME_RATE_HZ + 0.01)
     clouds = [_sample_points(frame, rng) for frame in x]
     first = _interpolate_bilinear(x[0], np.asarray(coarse.cloth.uv)) + 2e-4 * rng.standard_normal(

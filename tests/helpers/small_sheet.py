@@ -1,4 +1,4 @@
-"""A small sheet, for tests of the layer."""
+"""A small sheet for tests of ``Cloth``."""
 
 import torchcloth as tc
 

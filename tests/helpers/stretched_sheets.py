@@ -1,6 +1,6 @@
 """Cheap episodes of a sheet between two jaws, pulled and shaken, with force sensors and a camera in front.
 
-The truth has another mesh (and diagonals the other way), another step and, of course, other values than the model.
+The truth has another mesh with other diagonals, another step and other values than the model.
 """
 
 from __future__ import annotations
@@ -17,18 +17,18 @@ from torchcloth.robots import replay
 from torchcloth.training.studies.synthetic_sheets import interpolate_on_grid, simulate_readings
 
 WIDTH_M, HEIGHT_M = 0.30, 0.20  # m, between the jaws and along them
-THICKNESS_M = 1e-3  # m
+THICKNESS_M = 1e-3
 TRUTH_RESOLUTION, FIT_RESOLUTION = (22, 15), (13, 9)  # vertices
-POINTS_PER_FRAME = 400  # a frame, before occlusion
-FORCE_NOISE_N = 0.02  # N, white, at the knots
-KNOT_RATE_HZ = 50.0  # 1/s
+POINTS_PER_FRAME = 400  # before occlusion
+FORCE_NOISE_N = 0.02  # white, at the knots
+KNOT_RATE_HZ = 50.0
 FRAME_COUNT, FRAME_RATE_HZ = 16, 15.0
-VIEWING_DIRECTION = np.array([0.0, 0.0, 1.0])  # the camera looks along it
+VIEWING_DIRECTION = np.array([0.0, 0.0, 1.0])
 
 
 @dataclass(frozen=True)
 class Fabric:
-    """SI units."""
+    """Parameters of the fabric, SI units."""
 
     membrane: float = 60.0
     poisson: float = 0.3
@@ -39,15 +39,15 @@ class Fabric:
 
 @dataclass(frozen=True)
 class EpisodeSettings:
-    """How it is pulled and seen."""
+    """Motion, sensor and discretisation of an episode."""
 
     strain: float = 0.06
     heave: float = 0.05  # m
     depth: float = 1.0e-3  # m, noise along the camera's axis
     lateral: float = 0.35e-3  # m, a quarter of a pixel
     occluded: float = 0.3  # of the sheet's length, a bar in front of it
-    grasp: float = 0.5e-3  # m, error of the first shape at each jaw, and linearly between them
-    initial: float = 0.2e-3  # m, more of it at every free vertex
+    grasp: float = 0.5e-3  # m, error of the first shape at each jaw, linear between them
+    initial: float = 0.2e-3  # m, further error of it at every free vertex
     clock: float = 0.0  # s
     resolution: tuple[int, int] = TRUTH_RESOLUTION
     points: int = POINTS_PER_FRAME
@@ -56,7 +56,7 @@ class EpisodeSettings:
 
 
 def make_cloth(fabric: Fabric, resolution: tuple[int, int]) -> tc.Cloth:
-    """The sheet, its two short sides in jaws."""
+    """Return the sheet with its two short sides in jaws."""
     mesh = tc.meshes.rectangle(WIDTH_M, HEIGHT_M, resolution=resolution)
     effects = {
         "gravity": tc.effects.Gravity(),
@@ -69,44 +69,44 @@ def make_cloth(fabric: Fabric, resolution: tuple[int, int]) -> tc.Cloth:
 
 
 GRASPED_SIDES_U_M = {"left": 0.0, "right": WIDTH_M}
-GRASP_RADIUS_M = 0.006  # m
+GRASP_RADIUS_M = 0.006
 
 
 def jaw_points(name: str) -> np.ndarray:
-    """[41, 2] m, pattern points along a side."""
+    """Return pattern points [41, 2] m along a side."""
     along = np.linspace(0.0, HEIGHT_M, 41)
     return np.stack([np.full_like(along, GRASPED_SIDES_U_M[name]), along], axis=1)
 
 
 def make_pulling_motion(setting: EpisodeSettings) -> dict[str, rec.GripperMotion]:
-    """Apart and back once, up and down twice."""
+    """Return a motion: apart and back once, up and down twice."""
     end = (setting.frames - 1) / setting.rate + 0.2
     t = np.arange(0.0, end, 1 / KNOT_RATE_HZ)
-    part = 0.01 + 0.5 * setting.strain * (1 - np.cos(2 * np.pi * np.clip(t, 0, 1.0)))
+    elongation = 0.01 + 0.5 * setting.strain * (1 - np.cos(2 * np.pi * np.clip(t, 0, 1.0)))
     lift = 0.5 * setting.heave * (1 - np.cos(2 * np.pi * 2.0 * np.clip(t, 0, 1.0)))
     out = {}
     for name, u in GRASPED_SIDES_U_M.items():
-        x = (u - WIDTH_M / 2) * (1 + part)
+        x = (u - WIDTH_M / 2) * (1 + elongation)
         position = np.stack([x, 0 * t, 1.0 + lift], axis=1)
         out[name] = rec.GripperMotion(t, position, np.tile([1.0, 0, 0, 0], (len(t), 1)), np.ones(len(t), bool))
     return out
 
 
 def flat_positions(mesh: tc.meshes.Mesh) -> torch.Tensor:
-    """[V, 3] m, taut between the jaws at the first knot."""
+    """Return positions [V, 3] m of the taut sheet between the jaws at the first knot."""
     u, v = torch.as_tensor(mesh.uv).T
     return torch.stack([1.01 * (u - WIDTH_M / 2), v - HEIGHT_M / 2, torch.ones_like(u)], dim=-1)
 
 
 def interpolate(x: np.ndarray, shape: tuple[int, int], uv: np.ndarray) -> np.ndarray:
-    """Positions [N, 3] m of material points on a grid of vertices."""
+    """Return positions [N, 3] m of material points on a grid of vertices."""
     return interpolate_on_grid(x, shape, uv / [WIDTH_M, HEIGHT_M])
 
 
 def record_episode(
     fabric: Fabric | None = None, seed: int = 0, setting: EpisodeSettings | None = None, markers: int = 0
 ) -> rec.Recording:
-    """One episode: clouds, forces, and a noisy first shape on the model's mesh; ``markers`` a side where asked for."""
+    """Return an episode: clouds, forces, a noisy first shape on the model's mesh, and ``markers`` per side if not 0."""
     fabric, setting = fabric or Fabric(), setting or EpisodeSettings()
     rng = np.random.default_rng(seed)
     truth, mesh = (
@@ -114,14 +114,16 @@ def record_episode(
         tc.meshes.rectangle(WIDTH_M, HEIGHT_M, resolution=FIT_RESOLUTION),
     )
     motion = make_pulling_motion(setting)
-    bare = rec.Recording(cloth=rec.ClothInfo(areal_density=1.0), provenance="synthetic: stretches.py", grippers=motion)
+    motion_recording = rec.Recording(
+        cloth=rec.ClothInfo(areal_density=1.0), provenance="synthetic: stretched_sheets.py", grippers=motion
+    )
     knots = motion["left"].t
     frames = np.arange(setting.frames) / setting.rate
     times = np.union1d(knots[knots <= frames[-1] + 0.15], frames + setting.clock)
     with torch.no_grad():
-        moves = replay(bare)
-        state = truth.settle(truth.state(flat_positions(truth.mesh)), moves, duration=0.6)
-        out = truth(state, moves, times.tolist(), dt=0.6 * truth.stable_step())
+        trajectories = replay(motion_recording)
+        state = truth.settle(truth.state(flat_positions(truth.mesh)), trajectories, duration=0.6)
+        out = truth(state, trajectories, times.tolist(), dt=0.6 * truth.stable_step())
     forces = {name: simulate_readings(out, name, knots, FORCE_NOISE_N, rng) for name in motion}
     x = out.x[np.searchsorted(times, frames + setting.clock)].numpy()
     clouds = [_sample_cloud(frame, setting, rng) for frame in x]
@@ -136,7 +138,7 @@ def record_episode(
             uv=mesh.uv,
             initial_vertices=first + _draw_first_error(np.asarray(mesh.uv), setting, rng),
         ),
-        provenance="synthetic: tests/identification/stretches.py",
+        provenance="synthetic: tests/helpers/stretched_sheets.py",
         grasps={name: rec.GraspInfo(jaw_points(name), GRASP_RADIUS_M) for name in GRASPED_SIDES_U_M},
         grippers={name: replace(m, force=forces[name]) for name, m in motion.items()},
         points=rec.PointClouds(frames, np.concatenate(clouds), np.array([len(c) for c in clouds])),
@@ -155,7 +157,7 @@ def _sample_cloud(x: np.ndarray, setting: EpisodeSettings, rng: np.random.Genera
 
 
 def _draw_first_error(uv: np.ndarray, setting: EpisodeSettings, rng: np.random.Generator) -> np.ndarray:
-    """[V, 3] m: as a shape that was fitted to an image is off, smoothly."""
+    """Return errors [V, 3] m as of a shape that was fitted to an image: smooth along the sheet, and noise."""
     share = uv[:, :1] / WIDTH_M
     left, right = setting.grasp * rng.standard_normal((2, 3))
     free = (uv[:, :1] > 1e-6) & (uv[:, :1] < WIDTH_M - 1e-6)
@@ -165,7 +167,7 @@ def _draw_first_error(uv: np.ndarray, setting: EpisodeSettings, rng: np.random.G
 def _make_markers(
     x: np.ndarray, t: np.ndarray, side: int, setting: EpisodeSettings, rng: np.random.Generator
 ) -> rec.Markers:
-    """A grid of material points, a fifth of the sightings lost."""
+    """Return a grid of markers; a fifth of the observations is missing."""
     u, v = np.meshgrid(np.linspace(0.1, 0.9, side) * WIDTH_M, np.linspace(0.1, 0.9, side) * HEIGHT_M)
     uv = np.stack([u.ravel(), v.ravel()], axis=1)
     xyz = np.stack([interpolate(frame, setting.resolution, uv) for frame in x])
@@ -175,7 +177,7 @@ def _make_markers(
 
 
 def remesh_recording(recording: rec.Recording, resolution: tuple[int, int]) -> rec.Recording:
-    """The same episode on another mesh of the model: its first shape is interpolated."""
+    """Return the episode on another mesh of the model, with the interpolated first shape."""
     mesh = tc.meshes.rectangle(WIDTH_M, HEIGHT_M, resolution=resolution)
     info = recording.cloth
     first = interpolate(info.initial_vertices, FIT_RESOLUTION, np.asarray(mesh.uv))
@@ -186,8 +188,8 @@ def remesh_recording(recording: rec.Recording, resolution: tuple[int, int]) -> r
 def build_start_cloth(
     recording: rec.Recording, resolution: tuple[int, int] = FIT_RESOLUTION, **start: float
 ) -> tc.Cloth:
-    """The cloth of an episode with some start values, by default wrong ones."""
-    found = make_cloth(Fabric(membrane=150.0, poisson=0.2, density=recording.cloth.areal_density), resolution)
+    """Return the cloth of an episode with some start values; the others are wrong."""
+    start_cloth = make_cloth(Fabric(membrane=150.0, poisson=0.2, density=recording.cloth.areal_density), resolution)
     for name, value in start.items():
-        found.get_submodule(find_scalar_parameters(found)[name]).set(value)
-    return found
+        start_cloth.get_submodule(find_scalar_parameters(start_cloth)[name]).set(value)
+    return start_cloth

@@ -1,4 +1,4 @@
-"""A square cloth of known size hung from a gripper that stands, swings and stands again; observed with known faults."""
+"""A square cloth that hangs from a gripper at rest, swinging, and at rest again; observed with known faults."""
 
 import numpy as np
 
@@ -8,7 +8,7 @@ SIDE_M, NODES_PER_SIDE = 0.3, 8
 
 
 def gripper_path(t):
-    """Gripper position [T, 3] m: 1.5 s of rest, 4 s of strokes that are never alike, rest."""
+    """Return gripper positions [T, 3] m: 1.5 s of rest, 4 s of strokes that never repeat, rest."""
     s = np.clip(t - 1.5, 0, 4)
     envelope = np.sin(np.pi * s / 4) ** 2
     y = 0.15 * envelope * np.sin(2 * np.pi * (0.5 * s + 0.1 * s**2))
@@ -16,7 +16,7 @@ def gripper_path(t):
 
 
 def node_positions(t, nodes=NODES_PER_SIDE):
-    """Nodes [T, M, 3] m of the cloth, rows from the top; columns are straight, and lean with the motion."""
+    """Return nodes [T, M, 3] m of the cloth, rows from the top; columns are straight and lean with the motion."""
     u, v = np.meshgrid(np.linspace(0, SIDE_M, nodes), np.linspace(0, SIDE_M, nodes))
     lean = 0.6 * np.gradient(gripper_path(t)[:, 1], t) if len(t) > 1 else np.zeros(1)
     down = np.stack([np.zeros_like(lean), -np.sin(lean), -np.cos(lean)], -1)
@@ -40,14 +40,14 @@ def make_episode(**streams):
 
 
 def make_markers(noise=0.002, lag=0.0, rate=12.0, seed=0, **extra):
-    """Markers at even times, stamped ``lag`` s late."""
+    """Return markers at even times, stamped ``lag`` s late."""
     t = np.arange(0.2, 7.2, 1 / rate)
     xyz = node_positions(t) + noise * np.random.default_rng(seed).standard_normal((len(t), NODES_PER_SIDE**2, 3))
     return rec.Markers(t + lag, xyz, **extra)
 
 
 def make_clouds(noise=0.002, lag=0.0, rate=12.0, count=600, seed=0):
-    """Points strewn over the cloth, with noise along its normal."""
+    """Return random points of the cloth, with noise along its normal."""
     rng = np.random.default_rng(seed)
     t = np.arange(0.2, 7.2, 1 / rate)
     corners = node_positions(t, 2).reshape(len(t), 2, 2, 3)

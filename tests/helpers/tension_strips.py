@@ -1,4 +1,4 @@
-"""A strip in a tension machine, at rest: Newton's method on the energy of the layer's own triangles, in the plane."""
+"""A strip in a tension machine, at rest: Newton's method on the library's membrane energy, in the plane."""
 
 from __future__ import annotations
 
@@ -17,10 +17,16 @@ RELATIVE_FORCE_TOLERANCE = 1e-9  # of the largest force on a vertex, relative to
 
 @dataclass
 class Strip:
-    """Pulled along world x, which lies at ``angle`` degrees to the warp.
+    """A strip that is pulled along world x.
 
-    ``clamped``: the ends cannot move across; otherwise they slide, and the strain is uniform. ``crowded``: 0 to 1, how
-    much the mesh is finer towards the ends, where clamps disturb the strain.
+    Attributes:
+        length: m.
+        width: m.
+        angle: degrees, from the warp to x.
+        material: the law.
+        resolution: vertices along and across.
+        clamped: the ends cannot move across; otherwise they slide, and the strain is uniform.
+        crowded: 0 to 1, refinement of the mesh towards the ends, where clamps disturb the strain.
     """
 
     length: float
@@ -49,11 +55,11 @@ class Strip:
         self.start = None
 
     def energy(self, x: Tensor) -> Tensor:
-        """J, of positions [V, 2] m."""
-        return self._apart(x[self.faces])
+        """Return the energy [J] at positions [V, 2] m."""
+        return self._energy_of_corners(x[self.faces])
 
-    def _apart(self, corners: Tensor) -> Tensor:
-        """Energy J of triangles that do not hang together, from their corners [..., E, 3, 2] m."""
+    def _energy_of_corners(self, corners: Tensor) -> Tensor:
+        """Return the energy [J] of separate triangles with corners [..., E, 3, 2] m."""
         model = self.cloth.build_model()
         x = corners.transpose(-3, -2).flatten(-3, -2)
         x = torch.cat([x, torch.zeros_like(x[..., :1])], dim=-1)
@@ -62,9 +68,9 @@ class Strip:
         return (geometry.area * model.material.membrane_energy(model.coefficients, s)).sum()
 
     def _derivatives(self, x: Tensor) -> tuple[Tensor, Tensor]:
-        """Gradient [L, 2 V] and second derivative [L, 2 V, 2 V] of the energy; triangles give 6 x 6 blocks each."""
+        """Return gradient [L, 2 V] and Hessian [L, 2 V, 2 V] of the energy, from 6 x 6 blocks of triangles."""
         corners, size = x[:, self.faces], 2 * x.shape[-2]
-        slope = torch.func.grad(self._apart)
+        slope = torch.func.grad(self._energy_of_corners)
         seeds = torch.eye(6).unflatten(-1, (3, 2)).expand(*corners.shape[:2], 6, 3, 2)
         blocks = torch.stack([torch.func.jvp(slope, (corners,), (seeds[:, :, k],))[1] for k in range(6)], dim=-3)
         index = (2 * self.faces.unsqueeze(-1) + torch.arange(2)).flatten(1)  # [E, 6]
@@ -74,12 +80,12 @@ class Strip:
         return gradient, second.unflatten(1, (size, size))
 
     def hessian(self, x: Tensor) -> Tensor:
-        """Second derivative [2 V, 2 V] N/m of the energy at positions [V, 2] m."""
+        """Return the Hessian [2 V, 2 V] N/m of the energy at positions [V, 2] m."""
         with torch.no_grad():
             return self._derivatives(x[None])[1][0]
 
     def pull(self, elongation: Tensor) -> tuple[Tensor, Tensor]:
-        """Forces [L] N that hold the elongations [L] m, and the positions [L, V, 2] m."""
+        """Return the forces [L] N at the elongations [L] m, and the positions [L, V, 2] m."""
         ramp = torch.stack([self.rest[:, 0] / self.length, torch.zeros(len(self.rest))], dim=-1)
         x = self.rest + elongation[:, None, None] * ramp if self.start is None else self.start
         with torch.no_grad():
@@ -92,4 +98,4 @@ class Strip:
                 step = torch.zeros_like(gradient)
                 step[:, self.free] = torch.linalg.solve(second[:, self.free][..., self.free], gradient[:, self.free])
                 x = x - step.unflatten(-1, (-1, 2))
-        raise AssertionError("the strip found no equilibrium")
+        raise AssertionError("the strip has no equilibrium after 30 steps")

@@ -1,8 +1,8 @@
-"""Small episodes made by our own engine, to test the fit and not the physics.
+"""Small episodes from the library's engine, to test the fit and not the physics.
 
-Same-engine twins: the model that fits is the model that made the data (an inverse crime), softened by another mesh,
-another substep and sensor noise. They show that the machinery finds what it should, says how well, and notices what it
-cannot know. Whether the physics is right is asked of the shipped example, whose truth comes from another engine.
+The model that is fitted also made the data (an inverse crime), with another mesh, another substep and sensor noise.
+The tests show that the fit recovers parameters, states their uncertainty and detects what is not identifiable. The
+shipped example, whose truth comes from another engine, tests the physics.
 """
 
 from __future__ import annotations
@@ -19,20 +19,20 @@ from torchcloth import recordings as rec
 from torchcloth.episodes.unknowns import find_scalar_parameters
 from torchcloth.robots import replay
 
-SIDE_M = 0.3  # m
-THICKNESS_M = 1e-3  # m
-GRASPED_EDGES_U_M = {"left": 0.0, "right": SIDE_M}  # u of the edge that each gripper's jaw holds in its whole length
+SIDE_M = 0.3
+THICKNESS_M = 1e-3
+GRASPED_EDGES_U_M = {"left": 0.0, "right": SIDE_M}  # u of the edge that each gripper holds along its length
 JAW_V_M = np.linspace(0.0, SIDE_M, 61)
-GRASP_RADIUS_M = 0.0018  # m, holds the edge's vertices and no others, of any mesh used here
+GRASP_RADIUS_M = 0.0018  # contains the vertices of the edge only, on all meshes of these tests
 TRUTH_RESOLUTION, FIT_RESOLUTION = (11, 11), (7, 7)  # vertices along the sides
-NOISE_M = 1e-3  # m
+NOISE_M = 1e-3
 FRAME_COUNT, FRAME_RATE_HZ = 15, 20.0  # 0.7 s
-POINTS_PER_FRAME = 120  # a frame
+POINTS_PER_FRAME = 120
 
 
 @dataclass(frozen=True)
 class Fabric:
-    """Soft and heavy: few substeps, large and smooth response. SI units."""
+    """A soft and heavy fabric: few substeps, large and smooth response. SI units."""
 
     membrane: float = 40.0
     poisson: float = 0.25
@@ -43,11 +43,11 @@ class Fabric:
 
 
 TRUE_FABRIC = Fabric()
-NOMINAL_FABRIC = Fabric(membrane=80.0, poisson=0.15)  # the data sheet's values: a start that is wrong
+NOMINAL_FABRIC = Fabric(membrane=80.0, poisson=0.15)  # values of the data sheet: a wrong start
 
 
 def make_cloth(fabric: Fabric, resolution: tuple[int, int], drag: bool = True) -> tc.Cloth:
-    """The sheet in two grippers."""
+    """Return the sheet in two grippers."""
     effects = {"gravity": tc.effects.Gravity(), "bending": tc.effects.Bending(fabric.bending, fabric.damping_time)}
     if drag:
         effects["air"] = tc.effects.AirDrag(fabric.drag)
@@ -58,14 +58,14 @@ def make_cloth(fabric: Fabric, resolution: tuple[int, int], drag: bool = True) -
 
 
 def jaw_points(name: str) -> np.ndarray:
-    """[61, 2] m, pattern points along an edge."""
+    """Return pattern points [61, 2] m along an edge."""
     return np.stack([np.full_like(JAW_V_M, GRASPED_EDGES_U_M[name]), JAW_V_M], axis=1)
 
 
 def make_shaking_motion(
     amplitude: float = 0.08, rate: float = 2.5, duration: float = 0.72
 ) -> dict[str, rec.GripperMotion]:
-    """Both grippers go up and down together; apart they stay at the sheet's width and 3 %, so that it is taut."""
+    """Return a motion of both grippers, up and down together. The sheet is taut, 3 % above its width."""
     t = np.linspace(0.0, duration, 37)
     height = 1.0 + 0.5 * amplitude * (1 - np.cos(2 * np.pi * rate * t))
     out = {}
@@ -77,13 +77,13 @@ def make_shaking_motion(
 
 
 def flat_positions(model: tc.Cloth) -> torch.Tensor:
-    """[V, 3] m, the flat sheet between the grippers, before it sags."""
+    """Return positions [V, 3] m of the flat sheet between the grippers, before it sags."""
     u, v = torch.as_tensor(model.mesh.uv).T
     return torch.stack([v - SIDE_M / 2, 1.03 * (u - SIDE_M / 2), torch.ones_like(u)], dim=-1)
 
 
 def interpolate_bilinear(x: np.ndarray, shape: tuple[int, int], uv: np.ndarray) -> np.ndarray:
-    """Positions [N, 3] m of material points on a grid of vertices."""
+    """Return positions [N, 3] m of material points on a grid of vertices."""
     columns, rows = shape
     place = np.clip(uv / SIDE_M, 0, 1) * [columns - 1, rows - 1]
     cell = np.minimum(place.astype(int), [columns - 2, rows - 2])
@@ -96,7 +96,7 @@ def interpolate_bilinear(x: np.ndarray, shape: tuple[int, int], uv: np.ndarray) 
 def make_twin(
     fabric: Fabric = TRUE_FABRIC, seed: int = 0, amplitude: float = 0.08, rate: float = 2.5, noise: float = NOISE_M
 ) -> rec.Recording:
-    """One episode: clouds of the true sheet with noise, and the sheet's first shape on the coarser mesh of the fit."""
+    """Return an episode: noisy clouds of the true sheet, and its first shape on the coarser mesh of the fit."""
     rng = np.random.default_rng(seed)
     truth, mesh = make_cloth(fabric, TRUTH_RESOLUTION), tc.meshes.rectangle(SIDE_M, SIDE_M, resolution=FIT_RESOLUTION)
     motion = make_shaking_motion(amplitude, rate)
@@ -124,7 +124,7 @@ def make_twin(
                 "bending_damping_time": NOMINAL_FABRIC.damping_time,
             },
         ),
-        provenance="synthetic: tests/identification/twins.py",
+        provenance="synthetic: tests/helpers/twins.py",
         grasps={name: rec.GraspInfo(jaw_points(name), GRASP_RADIUS_M) for name in GRASPED_EDGES_U_M},
         grippers=motion,
         points=rec.PointClouds(t, xyz, np.full(FRAME_COUNT, POINTS_PER_FRAME)),
@@ -134,20 +134,20 @@ def make_twin(
 
 
 def shift_clock(recording: rec.Recording, offset: float) -> rec.Recording:
-    """The same episode with the camera's clock ``offset`` seconds behind the motion's."""
+    """Return the episode with the camera's clock ``offset`` seconds behind the motion's."""
     points = replace(recording.points, t=recording.points.t - offset)
     return replace(recording, points=points, clock_offset=offset)
 
 
 def take_first_frames(recording: rec.Recording, frames: int) -> rec.Recording:
-    """The first frames only: enough where a test asks about the machinery, at half the cost."""
+    """Return the episode with the first frames only, at lower cost."""
     points = recording.points
-    kept = int(points.counts[:frames].sum())
-    return replace(recording, points=rec.PointClouds(points.t[:frames], points.xyz[:kept], points.counts[:frames]))
+    count = int(points.counts[:frames].sum())
+    return replace(recording, points=rec.PointClouds(points.t[:frames], points.xyz[:count], points.counts[:frames]))
 
 
 def build_cloth_at(recording: rec.Recording, **nominal: float) -> tc.Cloth:
-    """The cloth of an episode with some start values changed."""
+    """Return the cloth of an episode with some start values changed."""
     model = identification.build_cloth(recording)
     for name, value in nominal.items():
         model.get_submodule(find_scalar_parameters(model)[name]).set(value)
@@ -156,8 +156,8 @@ def build_cloth_at(recording: rec.Recording, **nominal: float) -> tc.Cloth:
 
 @contextmanager
 def use_float64():
-    """float64 for what is made once for all tests, before the fixture that sets it for each."""
-    before = torch.get_default_dtype()
+    """Set float64 for session fixtures, which run before the fixture that sets it for each test."""
+    default = torch.get_default_dtype()
     torch.set_default_dtype(torch.float64)
     yield
-    torch.set_default_dtype(before)
+    torch.set_default_dtype(default)

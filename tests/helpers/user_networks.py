@@ -1,10 +1,10 @@
-"""A user's network."""
+"""Networks as a user might write them."""
 
 import torch
 
 
 class SmallNetwork(torch.nn.Module):
-    """Two layers with dropout: what is random must be resumed too."""
+    """Two layers with dropout: a resumed run must restore the random state."""
 
     def __init__(self, width: int, drop: float = 0.0):
         super().__init__()
@@ -16,19 +16,19 @@ class SmallNetwork(torch.nn.Module):
 
 
 class NanGradientNetwork(SmallNetwork):
-    """Its gradient is no number from the second step on: of a root that has come to nothing, say."""
+    """A network whose gradient is NaN from the second step on, as that of a square root at 0."""
 
     def __init__(self):
         super().__init__(3)
-        self.begun = self.layers[0].weight.detach().clone()
+        self.first_weight = self.layers[0].weight.detach().clone()
 
     def forward(self, places):
-        moved = (self.layers[0].weight - self.begun).square().sum()
+        moved = (self.layers[0].weight - self.first_weight).square().sum()
         return super().forward(places) + (0.0 if moved == 0 else 0.0 * (moved - moved.detach()).sqrt())
 
 
 class BatchNormNetwork(torch.nn.Sequential):
-    """It remembers what it has seen."""
+    """A network with running statistics."""
 
     def __init__(self):
         super().__init__(torch.nn.Linear(2, 3), torch.nn.BatchNorm1d(3), torch.nn.Linear(3, 1))

@@ -192,7 +192,7 @@ CASES = {
     "tum": ("tum", {}),
     "rosbag2 of MCAP": ("ros2", {}),
     "rosbag2 of sqlite": ("ros2", {"storage": "sqlite3"}),
-    "sealed MCAP": ("ros2", {"seal": True}),
+    "MCAP with checksums": ("ros2", {"checksums": True}),
     "lerobot": ("lerobot", {}),
     "kinect": ("kinect", {}),
 }
@@ -201,11 +201,15 @@ UNNOTICEABLE = {  # pixels of PNG only when two whole files change places
     "tum": f"{PIXELS}|{TIMES}|{LENS}",
     "rosbag2 of MCAP": f"{PIXELS}|{TIMES}|{LENS}|{MOTION}",
     "rosbag2 of sqlite": f"{PIXELS}|{TIMES}|{LENS}|{MOTION}",
-    "sealed MCAP": "",
+    "MCAP with checksums": "",
     "lerobot": PIXELS,
     "kinect": f"{PIXELS}|{TIMES}|{LENS}",
 }
-SHARE = {"rosbag2 of MCAP": 0.34, "rosbag2 of sqlite": 0.33, "sealed MCAP": 0.33}  # three ways to write one format
+SHARE = {
+    "rosbag2 of MCAP": 0.34,
+    "rosbag2 of sqlite": 0.33,
+    "MCAP with checksums": 0.33,
+}  # three ways to write one format
 
 
 def places(node, path=()):
