@@ -13,9 +13,46 @@ torch.set_num_threads(1)
 WORKERS = 3  # of `make test`; each begins with a third of the tests
 LONGEST_FILES = ("test_hidden_round.py", "test_diagnose.py", "test_resuming.py", "test_demo.py", "test_notebooks.py")
 
-# Files whose tests take about a second each or more, together four fifths of the time; `make test-fast` leaves them out.
+# Files whose tests take about a second each or more; `make test-fast` leaves them out.
 LONG_FILES = frozenset(
-    ["test_hidden_round.py", "test_diagnose.py", "test_resuming.py", "test_demo.py", "test_notebooks.py", "test_boundaries.py", "test_plan.py", "test_levenberg_marquardt.py", "test_diffcp_sample.py", "test_fabrics.py", "test_docs_code.py", "test_import_discipline.py", "test_inspect.py", "test_cli.py", "test_suite.py", "test_device.py", "test_nylon.py", "test_replan_episode.py", "test_effects.py", "test_statistics.py", "test_contact.py", "test_posterior_samples.py", "test_nuisances.py", "test_packaging.py", "test_replicates.py", "test_cases.py", "test_fit.py", "test_ablation.py", "test_metrics.py", "test_estimate.py", "test_tension.py", "test_library.py", "test_fuzz.py", "test_ablations.py", "test_fuzz_formats.py", "test_loading.py"]
+    [
+        "test_hidden_round.py",
+        "test_diagnose.py",
+        "test_resuming.py",
+        "test_demo.py",
+        "test_notebooks.py",
+        "test_boundaries.py",
+        "test_plan.py",
+        "test_levenberg_marquardt.py",
+        "test_diffcp_sample.py",
+        "test_fabrics.py",
+        "test_docs_code.py",
+        "test_import_discipline.py",
+        "test_inspect.py",
+        "test_cli.py",
+        "test_suite.py",
+        "test_device.py",
+        "test_nylon.py",
+        "test_replan_episode.py",
+        "test_effects.py",
+        "test_statistics.py",
+        "test_contact.py",
+        "test_posterior_samples.py",
+        "test_nuisances.py",
+        "test_packaging.py",
+        "test_replicates.py",
+        "test_cases.py",
+        "test_fit.py",
+        "test_ablation.py",
+        "test_metrics.py",
+        "test_estimate.py",
+        "test_tension.py",
+        "test_library.py",
+        "test_fuzz.py",
+        "test_ablations.py",
+        "test_fuzz_formats.py",
+        "test_loading.py",
+    ]
 )
 
 
