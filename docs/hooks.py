@@ -52,8 +52,9 @@ def on_files(files: Files, config) -> Files:
     for path, text in pages.items():
         files.append(File.generated(config, path, content=text))
     for notebook in sorted((ROOT / "notebooks").glob("*.ipynb")):
-        files.append(File(f"tutorials/{notebook.name}", str(ROOT), config["site_dir"], config["use_directory_urls"]))
-        files.get_file_from_path(f"tutorials/{notebook.name}").abs_src_path = str(notebook)
+        page = File(f"tutorials/{notebook.name}", str(ROOT), config["site_dir"], config["use_directory_urls"])
+        page.abs_src_path = str(notebook)
+        files.append(page)
     return files
 
 

@@ -6,11 +6,13 @@ from typing import NamedTuple
 
 import numpy as np
 
+from torchcloth._utils.constants import STANDARD_GRAVITY_M_PER_S2
+
 from ..cases import AREAL_DENSITY_KG_PER_M2, CELL_SIZE_M, MATERIAL, SUBSTEP_S, Case
 
 GRID_NODES_PER_AXIS = 44  # of the dense grid, along each axis
 THICKNESS_M = 1e-3  # m
-GRAVITY_Z_M_PER_S2 = -9.81  # m/s^2, along z
+GRAVITY_Z_M_PER_S2 = -STANDARD_GRAVITY_M_PER_S2
 VERTEX_SHARE, TRIANGLE_SHARE = 0.75, 0.25  # of the mass of vertices; of a triangle's, that it carries itself
 
 

@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
+from .._utils.constants import Z_95
 from ..cloth import Cloth
 from ..episodes.observed import DEFAULT_FRAME_RATE_HZ, Episode, build_episode
 from ..episodes.replay import Frames, map_frames, simulate, simulate_with_tangents
@@ -21,7 +22,6 @@ from ..losses import find_closest_points
 from ..losses.surface import point_distances
 from ..recordings import Recording
 from ..recordings.size_checks import check_size
-from .estimators.levenberg_marquardt import NORMAL_QUANTILE_975
 from .estimators.linearity import LINEARITY_CRITERIA
 from .io.saved_fit import ClothBuilder, SavedFit, explain_unstable_step, read_saved_fit, rebuild_fitted_cloth
 from .residuals.metrics import distance_metrics, force_rms
@@ -262,7 +262,7 @@ class _NormalInterval(NamedTuple):
         normal = torch.nn.functional.normalize(torch.linalg.cross(b - a, c - a), dim=-1)
         along = (slopes * normal).sum(-1)
         variance = torch.einsum("k...,kl,l...->...", along, self.covariance.to(along), along).clamp(min=0)
-        return NORMAL_QUANTILE_975 * (variance + self.misfit_std**2).sqrt()
+        return Z_95 * (variance + self.misfit_std**2).sqrt()
 
 
 def _fitted_unknowns(fit: SavedFit, cloth: Cloth) -> tuple[list[Unknown], Tensor]:

@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
+from .._utils.constants import Z_95
 from .episode_prediction import EpisodePrediction
-from .estimators.levenberg_marquardt import NORMAL_QUANTILE_975
 from .pictures import AFTER_COLOUR, BEFORE_COLOUR, NULL_COLOUR
 from .tables import MIN_FIT_TABLE_COLUMNS
 from .tension.prediction import PredictionBand, TensionPrediction
@@ -82,7 +82,7 @@ def draw_band(axis: Any, x: np.ndarray, band: PredictionBand, order: np.ndarray 
     """Draw a curve and its intervals."""
     low, high = band.ci95
     axis.fill_between(x, low[order], high[order], color=AFTER_COLOUR, alpha=0.18, linewidth=0, label="all parts")
-    inner = NORMAL_QUANTILE_975 * band.parameter_std
+    inner = Z_95 * band.parameter_std
     ends = ((band.value - inner)[order], (band.value + inner)[order])
     axis.fill_between(x, *ends, color=AFTER_COLOUR, alpha=0.45, linewidth=0, label="by parameters")
     axis.plot(x, band.value[order], color=AFTER_COLOUR, label="predicted")

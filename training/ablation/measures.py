@@ -80,5 +80,4 @@ def rank_correlation(a: Sequence[float], b: Sequence[float]) -> float:
     """Return Spearman's rank correlation; NaN if one side is constant."""
     if min(len(set(a)), len(set(b))) < 2:  # scipy would warn
         return float("nan")
-    correlation, _ = spearmanr(a, b)
-    return float(correlation)
+    return float(np.asarray(spearmanr(a, b))[0])

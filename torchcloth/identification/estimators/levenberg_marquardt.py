@@ -9,12 +9,10 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from ..._utils.constants import Z_95
 from ...errors import SimulationDiverged, UnstableStep
 from ..residuals.metrics import HUBER_THRESHOLD, huber, noise_scale
 from .box_qp import solve_box_qp
-
-# Written with five digits since the first fits; ``constants.Z_95`` is rounded to three, which would move intervals.
-NORMAL_QUANTILE_975 = 1.95996
 
 
 @dataclass(frozen=True)
@@ -395,7 +393,7 @@ def covariance(problem: Problem, at: Iterate) -> Tensor:
     sandwich = inverse @ (meat + problem.precision) @ inverse
     limit = problem.noise_model.infinite_dof
     degrees = _degrees_of_freedom(problem, at, inverse)
-    widening = [student_quantile(n) / NORMAL_QUANTILE_975 if n < limit else 1.0 for n in degrees]
+    widening = [student_quantile(n) / Z_95 if n < limit else 1.0 for n in degrees]
     widening = torch.tensor(widening).to(sandwich)
     return inflate_covariance(sandwich, inverse.diagonal()) * widening[:, None] * widening
 
@@ -471,7 +469,7 @@ def student_quantile(degrees_of_freedom: int) -> float:
     It is 3.1 % low at two degrees of freedom and 0.2 % at four. Standard errors of all fits so far were widened by it,
     so it stays until a change of numbers is due; ``scipy.special.stdtrit`` has the exact one.
     """
-    z, n = NORMAL_QUANTILE_975, degrees_of_freedom
+    z, n = Z_95, degrees_of_freedom
     second = (5 * z**5 + 16 * z**3 + 3 * z) / (96 * n**2)
     return z + (z**3 + z) / (4 * n) + second + (3 * z**7 + 19 * z**5 + 17 * z**3 - 15 * z) / (384 * n**3)
 

@@ -18,6 +18,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from ..._utils.constants import Z_95
 from ...errors import SimulationDiverged, UnstableStep
 from ..residuals.metrics import noise_scale
 from ..uncertainty.consider_covariance import solution_covariance, with_grasp_offsets
@@ -366,7 +367,7 @@ def _ripple_covariance(problem: levenberg_marquardt.Problem, at: Iterate, regres
     inverse = torch.linalg.inv(levenberg_marquardt.information_matrix(problem, at))
     shifts = regression.scatter @ (at.row_weights()[0][:, None] * at.linear.jacobian) @ inverse
     degrees = regression.degrees_of_freedom
-    widening = levenberg_marquardt.student_quantile(degrees) / levenberg_marquardt.NORMAL_QUANTILE_975
+    widening = levenberg_marquardt.student_quantile(degrees) / Z_95
     return widening**2 * shifts.mT @ shifts / degrees + inverse @ problem.precision @ inverse
 
 

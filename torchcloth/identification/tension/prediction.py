@@ -9,10 +9,10 @@ from typing import Any
 
 import numpy as np
 
+from ..._utils.constants import Z_95
 from ...cloth import Cloth
 from ...errors import InvalidInput
 from ...recordings import ForceDisplacement
-from ..estimators.levenberg_marquardt import NORMAL_QUANTILE_975
 from .fit import TensionFit, fit_tension
 from .model import FittedTable, TensionModel, add_left_out_misfit, force_misfit
 
@@ -58,7 +58,7 @@ class PredictionBand:
     @property
     def ci95(self) -> tuple[np.ndarray, np.ndarray]:
         """Lower and upper end of the 95 % interval, [N] each."""
-        return self.value - NORMAL_QUANTILE_975 * self.std, self.value + NORMAL_QUANTILE_975 * self.std
+        return self.value - Z_95 * self.std, self.value + Z_95 * self.std
 
     def as_dict(self) -> dict[str, Any]:
         """Return the content for JSON."""

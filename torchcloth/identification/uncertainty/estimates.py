@@ -9,6 +9,7 @@ from typing import NamedTuple
 
 from torch import Tensor
 
+from ..._utils.constants import Z_95
 from ...cloth import Cloth
 from ...episodes.observed import Episode
 from ...episodes.unknowns import (
@@ -20,7 +21,6 @@ from ...episodes.unknowns import (
     needs_contact,
 )
 from ...materials import AEP
-from ..estimators.levenberg_marquardt import NORMAL_QUANTILE_975
 from ..nuisances import NuisanceSlice
 
 
@@ -181,12 +181,12 @@ def make_nuisance_estimates(
         for s in slices:
             values, stds = raw[s.index].tolist(), deviation[s.index].tolist()
             for part, unit, prior, value, std in zip(s.names, s.units, s.stds, values, stds, strict=True):
-                half_width = NORMAL_QUANTILE_975 * std
+                half_width = Z_95 * std
                 interval = (value - half_width, value + half_width)
                 identifiable = std < criteria.max_std_over_prior_std * prior and not withdrawn
                 if withdrawn:
                     std = math.hypot(prior, value)
-                    half_width = NORMAL_QUANTILE_975 * prior
+                    half_width = Z_95 * prior
                     interval = (min(-half_width, value), max(half_width, value))
                 out[name][part] = Estimate(value, std, interval, unit, 0.0, identifiable, "nuisance")
     return out
@@ -237,7 +237,7 @@ def apply_profiles(estimates: EstimateSet, profiles: Mapping[str, Profile]) -> E
 def _estimate(unknown: Unknown, raw: float, deviation: float, criteria: IdentifiabilityCriteria) -> Estimate:
     value = unknown.value(raw)
     std = unknown.slope(raw) * deviation
-    half_width = NORMAL_QUANTILE_975 * deviation
+    half_width = Z_95 * deviation
     low, high = (unknown.value(unknown.clip(raw + sign * half_width)) for sign in (-1, 1))
     # a default prior is no knowledge, a measured one is
     is_informed = unknown.measured or deviation < criteria.max_std_over_prior_std * unknown.prior_std
@@ -249,7 +249,7 @@ def _estimate(unknown: Unknown, raw: float, deviation: float, criteria: Identifi
 
 def _prior_estimate(unknown: Unknown, source: str) -> Estimate:
     """Estimate of a material parameter that was not fitted: only its prior is known."""
-    value, half_width = unknown.value(unknown.prior_mean), NORMAL_QUANTILE_975 * unknown.prior_std
+    value, half_width = unknown.value(unknown.prior_mean), Z_95 * unknown.prior_std
     low, high = (unknown.value(unknown.clip(unknown.prior_mean + sign * half_width)) for sign in (-1, 1))
     std = unknown.slope(unknown.prior_mean) * unknown.prior_std
     return Estimate(value, std, (low, high), unknown.parameter.unit, value, False, source)

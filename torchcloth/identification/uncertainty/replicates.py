@@ -9,9 +9,10 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
+from ..._utils.constants import Z_95
 from ...recordings import Recording
 from ..estimators import levenberg_marquardt
-from ..estimators.levenberg_marquardt import NORMAL_QUANTILE_975, Iterate, Problem, student_quantile
+from ..estimators.levenberg_marquardt import Iterate, Problem, student_quantile
 
 MIN_REPLICATES = 3  # episodes that show a scatter
 MAX_REFIT_ITERATIONS = 8
@@ -86,7 +87,7 @@ def jackknife_variance(problem: Problem, at: Iterate, episode: Tensor, strata: T
             total += group.square().sum(0)
             continue
         variance = (len(group) - 1) / len(group) * (group - group.mean(0)).square().sum(0)
-        total += (student_quantile(len(group) - 1) / NORMAL_QUANTILE_975) ** 2 * variance
+        total += (student_quantile(len(group) - 1) / Z_95) ** 2 * variance
     return total
 
 

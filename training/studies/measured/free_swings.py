@@ -11,7 +11,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from torchcloth._utils.constants import STANDARD_AIR_DENSITY_KG_PER_M3
+from torchcloth._utils.constants import STANDARD_AIR_DENSITY_KG_PER_M3, Z_95
+from torchcloth.episodes.unknowns import IDENTIFIABILITY_CRITERIA
 
 from .swing_predictions import bootstrap_indices, frequency_and_decay, predict
 from .swings import FITTED_NAMES, NOMINAL_DENSITY_KG_PER_M2, RATIO_UNITS
@@ -39,7 +40,13 @@ def match(source: Path, names: Sequence[str], fast: bool) -> dict[str, Any]:
     drag_std = drag * measured["decay_std"] / measured["decay"]
     named = zip(RATIO_UNITS, ((drag, drag_std), (mass, mass_std)), strict=False)
     ratios = {
-        name: {"value": v, "std": s, "low": v - 1.96 * s, "high": v + 1.96 * s, "identifiable": s < 0.25 * v}
+        name: {
+            "value": v,
+            "std": s,
+            "low": v - Z_95 * s,
+            "high": v + Z_95 * s,
+            "identifiable": IDENTIFIABILITY_CRITERIA.is_precise(s, v, 0.0),
+        }
         for name, (v, s) in named
     }
     return {"values": values, "ratios": ratios, "measured": measured, "reached": simulated}

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from torchcloth._utils.constants import Z_95
 from torchcloth.identification.pictures import AFTER_COLOUR, BEFORE_COLOUR, NULL_COLOUR, save_figure
 from torchcloth.identification.prediction_report import draw_band
 from torchcloth.identification.tension.prediction import PredictionBand
@@ -92,7 +93,7 @@ def swings(result: dict[str, Any], runs: dict[str, dict[str, Any]], path: Path) 
         shown = {m: p for m, p in result["predicted"].items() if key in p}
         for k, (model, p) in enumerate(shown.items()):
             colour = MODEL_COLOURS.get(model, "black")
-            axis.errorbar(p[key], -k, xerr=1.96 * p[f"{key}_std"], fmt="o", color=colour, capsize=3)
+            axis.errorbar(p[key], -k, xerr=Z_95 * p[f"{key}_std"], fmt="o", color=colour, capsize=3)
         axis.set_yticks(
             [-k for k in range(len(shown))], [MODEL_LABELS[m].replace(": ", ":\n") for m in shown], fontsize=8
         )

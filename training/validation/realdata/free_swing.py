@@ -24,7 +24,6 @@ from .swings import ROBUST_SCALE_M, Run, accepted_frames, motion_stop
 
 TYPICAL_LAG_S = 0.32  # of the stamps of the mesh
 SETTLING_AFTER_STOP_S = 0.3
-BESSEL_J0_SECOND_ZERO = 5.520078110286311
 
 
 class FreeSwing(NamedTuple):

@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 import torchcloth as tc
+from torchcloth._utils.constants import STANDARD_GRAVITY_M_PER_S2
 
 from .apic import APICCloth
 from .case_figures import line_colour
@@ -57,7 +58,7 @@ class Swing:
         """Return frames [T, 15 * 15, 3] m of the vertices that all meshes share, without shift and turn."""
         turn = rotation_matrix((1.0, 2.0, 3.0), self.turn)
         offset = self.shift * (self.spacing or COARSE_EDGE_M) * torch.ones(3)
-        cloth = self.make_cloth(tuple((turn @ torch.tensor([0.0, 0.0, -9.81])).tolist()))
+        cloth = self.make_cloth(tuple((turn @ torch.tensor([0.0, 0.0, -STANDARD_GRAVITY_M_PER_S2])).tolist()))
         u, v = torch.as_tensor(cloth.mesh.uv).T
         x = torch.stack([0 * u, u, v], dim=-1) @ turn.mT + offset
         t = torch.linspace(0, self.duration, round(200 * self.duration) + 1)

@@ -9,6 +9,7 @@ import numpy as np
 import torch
 
 import torchcloth as tc
+from torchcloth._utils.constants import STANDARD_GRAVITY_M_PER_S2
 from torchcloth.dynamics.kinematics import surface
 from torchcloth.types import EffectInputs
 
@@ -45,7 +46,7 @@ def frame_indifference(fast: bool) -> Outcome:
     displacement = 0.1 * torch.stack([t, torch.sin(12 * t), 0 * t], -1)
     results = []
     for turned in (False, True):
-        g = torch.tensor([0.0, 0.0, -9.81])
+        g = torch.tensor([0.0, 0.0, -STANDARD_GRAVITY_M_PER_S2])
         effects = {
             "gravity": tc.effects.Gravity(tuple((turn @ g if turned else g).tolist())),
             "air": tc.effects.AirDrag(1.2),
