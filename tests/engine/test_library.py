@@ -2,6 +2,7 @@
 
 import os
 import re
+import stat
 import subprocess
 import sys
 import threading
@@ -90,7 +91,7 @@ def test_a_compiler_that_fails(nowhere, tmp_path):
 
 
 def test_a_library_that_does_not_load(nowhere, tmp_path):
-    (tmp_path / "cache" / building.file_name()).write_text("not a library")
+    building.store(tmp_path / "cache" / building.file_name(), b"not a library")
     done = run(["-c", USE], **nowhere)
     assert done.returncode == 0, done.stderr
     assert "the engine's library does not load" in done.stderr
@@ -173,12 +174,61 @@ def test_somebody_elses_library_in_the_temporary_folder_is_not_loaded(small, mon
     monkeypatch.setattr(building.tempfile, "gettempdir", lambda: str(tmp_path / "tmp"))
     folder = building.cache_folders()[-1]
     folder.mkdir(parents=True)
-    (folder / building.file_name()).write_text("bad")
-    somebody = os.getuid() + 1
+    building.store(folder / building.file_name(), b"bad")
     monkeypatch.setattr(building, "cache_folders", lambda: [folder])  # named by the number of whom it belongs to
     assert building.cached() is not None
-    monkeypatch.setattr(building.os, "getuid", lambda: somebody)
+    for path in (folder / building.file_name(), folder, tmp_path):
+        with monkeypatch.context() as patch:
+            lstat = Path.lstat
+            patch.setattr(Path, "lstat", lambda p, path=path, lstat=lstat: belongs_to_another(lstat(p), p == path))
+            assert building.cached() is None, path
+
+
+def belongs_to_another(status, is_so):
+    return os.stat_result((*status[:4], 12345, *status[5:])) if is_so else status
+
+
+@pytest.mark.skipif(not hasattr(os, "getuid"), reason="no modes here")
+def test_what_others_could_write_or_exchange_is_not_loaded(small, monkeypatch, capfd):
+    folder, name = small / "cache", building.file_name()
+    folder.mkdir(mode=0o700)
+    building.store(folder / name, b"code")
+    assert building.cached() == folder / name
+    for path in (folder / name, folder, small):
+        usual = path.stat().st_mode
+        path.chmod(usual | stat.S_IWOTH)
+        assert building.cached() is None, path
+        path.chmod(usual)
+    small.chmod(small.stat().st_mode | stat.S_IWOTH | stat.S_ISVTX)  # as /tmp: nobody can exchange a folder of ours
+    assert building.cached() == folder / name
+    folder.chmod(0o777 | stat.S_ISVTX)  # nobody can exchange our library, but anybody could put another there
+    assert building.cached() == folder / name
+    monkeypatch.setattr(building, "cache_folders", lambda: [folder])
+    with pytest.raises(EngineUnavailable, match="can be written to"):
+        building.build()
+    assert f"{folder} is not used: others can write there" in capfd.readouterr().err
+
+
+@pytest.mark.skipif(not hasattr(os, "getuid"), reason="no modes here")
+def test_links_are_not_followed(small):
+    name = building.file_name()
+    (small / "elsewhere").mkdir(mode=0o700)
+    (small / "cache").mkdir(mode=0o700)
+    building.store(small / "elsewhere" / name, b"code")
+    (small / "cache" / name).symlink_to(small / "elsewhere" / name)
     assert building.cached() is None
+
+
+def test_half_a_library_is_built_anew(small):
+    """A power cut leaves one: to load it would kill the process, at every start."""
+    made = building.build()
+    whole = made.read_bytes()
+    for damaged in (whole[: len(whole) // 2], whole[:-1], b"", whole[:100] + b"x" + whole[101:]):
+        made.write_bytes(damaged)
+        assert building.cached() is None
+    assert building.build() == made
+    assert building.cached() == made
+    assert made.stat().st_mode & 0o777 == 0o700
 
 
 def test_one_that_came_with_the_package_is_preferred(monkeypatch, tmp_path):

@@ -3,6 +3,9 @@
 A library is named by its sources and by the processor and flags it was built for, so a wrong one is never taken. Wheels
 hold portable libraries as well: one for each instruction set level of ``PORTABLE_LEVELS``, named by level and sources.
 They serve where there is no library for the very processor and no compiler.
+
+A file of the cache is code that runs with the user's rights. It is taken only where nobody else could have written or
+exchanged it, and only whole: it ends with its own digest.
 """
 
 from __future__ import annotations
@@ -12,6 +15,7 @@ import os
 import platform
 import shlex
 import shutil
+import stat
 import subprocess
 import sys
 import tempfile
@@ -39,6 +43,7 @@ PORTABLE_LEVELS = {
     "arm64": {"armv8-a": frozenset()},
 }
 CLANG_FLAGS = "-fbracket-depth=16384 -fconstexpr-steps=200000000"  # its limits are lower than a kernel's trace
+DIGEST_MARK = b"torchcloth-sha256:"  # before the digest at the end of a file in the cache; ELF and cubin allow a tail
 KERNEL_BYTES_PER_CORE_SECOND = 420.0  # source that one core compiles in a second, measured with g++ 12
 
 
@@ -118,9 +123,66 @@ def cache_folders() -> list[Path]:
 
 
 def cached(name: str | None = None) -> Path | None:
-    """Return a file in the cache, by default the library; None if it is not there."""
+    """Return a file in the cache, by default the library; None if it is not there, whole, and safe to load."""
     name = file_name() if name is None else name
-    return next((folder / name for folder in cache_folders() if is_safe(folder / name)), None)
+    files = (trusted_path(folder / name) for folder in cache_folders())
+    return next((file for file in files if file is not None and is_whole(file)), None)
+
+
+def trusted_path(path: Path) -> Path | None:
+    """Return the real path of a file or folder that only this user or root could have made or exchanged; else None.
+
+    Every folder on the real path, from the root on, is checked in this order: it belongs to this user or to root, and
+    nobody else may write there, or only what is theirs (sticky). Then nobody else can exchange what was checked.
+    """
+    if not hasattr(os, "getuid"):
+        return path if path.exists() else None
+    try:
+        if path.is_symlink():
+            return None
+        real = path.resolve(strict=True)
+        for part in (*reversed(real.parents), real):
+            if not _is_private(part.lstat(), is_last=part == real):
+                return None
+    except (OSError, RuntimeError):  # not there, not to be seen, or a circle of links
+        return None
+    return real
+
+
+def _is_private(status: os.stat_result, is_last: bool) -> bool:
+    """Whether only root and this user can change an entry; a sticky folder on the way may be everybody's."""
+    others_may_write = bool(status.st_mode & stat.S_IWOTH)
+    # a private group of the user's has the user's number
+    group_may_write = bool(status.st_mode & stat.S_IWGRP) and status.st_gid not in (0, os.getuid())
+    is_sticky_folder = stat.S_ISDIR(status.st_mode) and bool(status.st_mode & stat.S_ISVTX)
+    is_ours = status.st_uid in (0, os.getuid()) and not stat.S_ISLNK(status.st_mode)
+    return is_ours and (not (others_may_write or group_may_write) or (is_sticky_folder and not is_last))
+
+
+def is_whole(file: Path) -> bool:
+    """Return whether a file of the cache ends with the digest of what comes before: a power cut leaves half a file."""
+    try:
+        content = file.read_bytes()
+    except OSError:
+        return False
+    return content == seal(content[: -len(seal(b""))])
+
+
+def seal(content: bytes) -> bytes:
+    """Return the content with its digest at the end, as files in the cache are stored."""
+    return content + DIGEST_MARK + hashlib.sha256(content).digest()
+
+
+def store(target: Path, content: bytes) -> None:
+    """Write a sealed file into the cache, whole or not at all, for nobody else to change."""
+    with tempfile.TemporaryDirectory(dir=target.parent) as scratch:
+        part = Path(scratch) / target.name
+        with part.open("wb") as file:
+            file.write(seal(content))
+            file.flush()
+            os.fsync(file.fileno())
+        part.chmod(0o700)
+        os.replace(part, target)
 
 
 def build(level: str | None = None) -> Path:
@@ -139,7 +201,7 @@ def build(level: str | None = None) -> Path:
         with suppress(OSError):
             target = folder / name
             with _build_lock(folder):  # another process may be building the same
-                if not is_safe(target):
+                if trusted_path(target) is None or not is_whole(target):
                     _compile(command, target, flags.split())
             return target
     places = ", ".join(str(f) for f in cache_folders())
@@ -148,12 +210,14 @@ def build(level: str | None = None) -> Path:
 
 
 def private_cache_folders() -> Iterator[Path]:
-    """Yield the cache folders that exist or can be made, and belong to nobody else; best first."""
+    """Yield the real paths of the cache folders that exist or can be made, and are private; best first."""
     for folder in cache_folders():
         with suppress(OSError):
             folder.mkdir(parents=True, exist_ok=True, mode=0o700)
-            if is_safe(folder):
-                yield folder
+            if (private := trusted_path(folder)) is not None:
+                yield private
+            else:
+                print(f"torchcloth: {folder} is not used: others can write there", file=sys.stderr, flush=True)
 
 
 def _sources() -> list[Path]:
@@ -169,15 +233,6 @@ def _processor() -> str:
             if name.strip() in ("flags", "Features"):
                 return " ".join(sorted(value.split()))
     return platform.processor()
-
-
-def is_safe(path: Path) -> bool:
-    """Return whether a file exists, and nobody else put it into a folder where everybody can write."""
-    try:
-        is_ours = not hasattr(os, "getuid") or path.stat().st_uid == os.getuid()
-    except OSError:
-        return False
-    return is_ours or not path.is_relative_to(tempfile.gettempdir())
 
 
 @contextmanager
@@ -207,7 +262,7 @@ def _compile(command: list[str], target: Path, flags: list[str]) -> None:
         with ThreadPoolExecutor(cores) as pool:
             objects = list(pool.map(compile_one, enumerate(files)))
         _run([*command, "-shared", "-pthread", *objects, "-o", str(library)])
-        os.replace(library, target)
+        store(target, library.read_bytes())
 
 
 def _run(command: list[str]) -> None:

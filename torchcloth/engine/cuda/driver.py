@@ -12,7 +12,6 @@ from pathlib import Path
 
 import torch
 
-from ..._utils.files import write_atomically
 from .. import building
 from ..building import EngineUnavailable
 
@@ -34,8 +33,8 @@ def _file_name(text: str, options: Sequence[str]) -> str:
 
 def _store(name: str, code: bytes) -> None:
     for folder in building.private_cache_folders():
-        with suppress(OSError), write_atomically(folder / name) as file:
-            file.write_bytes(code)
+        with suppress(OSError):
+            building.store(folder / name, code)
             return
 
 
