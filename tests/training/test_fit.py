@@ -2,8 +2,10 @@
 
 import csv
 import json
+import re
 import shutil
 import signal
+import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -18,6 +20,7 @@ from lightning.pytorch.callbacks import Callback
 import torchcloth as tc
 import torchcloth.training.fit.run as run
 from torchcloth import recordings as rec
+from torchcloth.errors import InvalidInput
 from torchcloth.training.fit.command import main
 from torchcloth.training.fit.config import Learn, Network, load
 from torchcloth.training.fit.learned_cloth import LearnedCloth
@@ -132,6 +135,7 @@ def test_a_gradient_that_is_no_number_is_not_followed(config, tmp_path, capsys):
         assert all(bool(value.isfinite().all()) for value in weights.values())
 
 
+@pytest.mark.filterwarnings("ignore:Attribute .description. removed from hparams")  # torch.save fails on purpose
 def test_a_checkpoint_is_there_whole_or_as_before(config, tmp_path, monkeypatch):
     path = config(optimizer={"steps": 1})
     assert main(["--config", path]) == 0
@@ -236,6 +240,53 @@ def test_a_network_loads_back(config, tmp_path):
     assert (
         json.loads((tmp_path / "out" / "fit.json").read_text())["identify_command"] is None
     )  # no number to start from
+
+
+@pytest.mark.parametrize("name", ["os.system", "torch.hub.load", "torch.nn.functional.relu"])
+def test_nothing_but_a_module_class_is_called(config, tmp_path, monkeypatch, name):
+    """Neither from YAML nor from a checkpoint, which anybody may have written."""
+    path = config(learn={"network": NETWORK}, optimizer={"steps": 1})
+    assert main(["--config", path]) == 0
+    checkpoint = torch.load(tmp_path / "out" / "last.ckpt", weights_only=True)
+    checkpoint["hyper_parameters"]["config"]["learn"]["network"] |= {"module": name, "arguments": {"command": "date"}}
+    torch.save(checkpoint, tmp_path / "bad.ckpt")
+    called = []
+    monkeypatch.setattr(name, lambda *_, **options: called.append(options))
+    with pytest.raises(InvalidInput, match=re.escape(name)):
+        FitModule.load_from_checkpoint(tmp_path / "bad.ckpt")
+    assert main(["--config", path, f"learn.network.module={name}", "optimizer.steps=2"]) == 2
+    assert not called
+
+
+def test_a_checkpoint_imports_nothing(config, tmp_path, monkeypatch):
+    """A class is imported before, or given."""
+    assert main(["--config", config(learn={"network": NETWORK}, optimizer={"steps": 1})]) == 0
+    network_class = sys.modules["helpers.user_networks"].SmallNetwork
+    monkeypatch.delitem(sys.modules, "helpers.user_networks")
+    with pytest.raises(InvalidInput, match="SmallNetwork, which is not imported"):
+        FitModule.load_from_checkpoint(tmp_path / "out" / "last.ckpt")
+    assert "helpers.user_networks" not in sys.modules
+    FitModule.load_from_checkpoint(tmp_path / "out" / "last.ckpt", network_class=network_class)
+
+
+def test_a_checkpoint_with_objects_is_refused(config, tmp_path):
+    """Also below torch 2.6, where Lightning would unpickle them."""
+    assert main(["--config", config(optimizer={"steps": 1})]) == 0
+    checkpoint = torch.load(tmp_path / "out" / "last.ckpt", weights_only=True)
+    torch.save({**checkpoint, "extra": Touch(tmp_path / "called")}, tmp_path / "bad.ckpt")
+    with pytest.raises(InvalidInput, match="holds more than tensors"):
+        FitModule.load_from_checkpoint(tmp_path / "bad.ckpt")
+    assert not (tmp_path / "called").exists()
+
+
+class Touch:
+    """Makes a file when it is unpickled."""
+
+    def __init__(self, path):
+        self.path = path
+
+    def __reduce__(self):
+        return Path.touch, (self.path,)
 
 
 def test_validation_is_held_out(config, episodes, tmp_path):

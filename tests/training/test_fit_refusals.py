@@ -95,6 +95,7 @@ LESS = "{in_features: -2, out_features: 1}"
         (["--resume"], "--resume; got no "),
     ],
 )
+@pytest.mark.filterwarnings("ignore:Implicit dimension choice for softmax")
 def test_one_line(config, episodes, tmp_path, capsys, options, words):
     path, wrong = config(), tmp_path / "kilometres"
     if "{kilometres}" in options[0]:
@@ -171,12 +172,22 @@ def test_a_network_whose_code_has_changed_is_not_resumed(config, tmp_path, capsy
     assert "another" in capsys.readouterr().err
 
 
+class Flat(nn.Linear):
+    def __init__(self):
+        super().__init__(2, 1)
+
+
+class Deep(nn.Sequential):
+    def __init__(self):
+        super().__init__(nn.Linear(2, 3), nn.Linear(3, 1))
+
+
 def test_a_network_that_has_changed_is_not_resumed(config, capsys, monkeypatch):
     network = {"module": "helpers.user_networks.Wavy", "outputs": ["poisson_ratio"]}
-    monkeypatch.setattr("helpers.user_networks.Wavy", lambda: nn.Linear(2, 1), raising=False)
+    monkeypatch.setattr("helpers.user_networks.Wavy", Flat, raising=False)
     path = config(optimizer={"steps": 1}, learn={"network": network})
     assert main(["--config", path]) == 0
-    monkeypatch.setattr("helpers.user_networks.Wavy", lambda: nn.Sequential(nn.Linear(2, 3), nn.Linear(3, 1)))
+    monkeypatch.setattr("helpers.user_networks.Wavy", Deep)
     assert main(["--config", path, "--resume"]) == 2
     assert "got learned.network.0.bias of shape none; expected (3,): the model" in capsys.readouterr().err
 

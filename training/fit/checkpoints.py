@@ -1,4 +1,4 @@
-"""Atomic writing of checkpoints.
+"""Atomic writing and safe reading of checkpoints.
 
 Lightning writes a checkpoint to the system's temporary folder and moves it. Between two file systems this copies over
 the only checkpoint, which is lost if the copy is interrupted.
@@ -14,6 +14,29 @@ import torch
 from lightning.pytorch.plugins.io import TorchCheckpointIO
 
 from torchcloth._utils.files import write_atomically
+from torchcloth._utils.resume import DAMAGED_FILE_ERRORS
+from torchcloth.errors import InvalidInput
+
+
+def read_checkpoint(path: str | Path) -> dict[str, Any]:
+    """Read a checkpoint, of which only tensors, numbers, text and their containers are accepted.
+
+    Raises:
+        InvalidInput: the file is damaged, is no checkpoint of a fit, or holds other objects.
+    """
+    try:
+        content = torch.load(path, weights_only=True, map_location="cpu")
+        is_whole = {"state_dict", "hyper_parameters", "history"} <= content.keys()
+    except (*DAMAGED_FILE_ERRORS, AttributeError):
+        content, is_whole = {}, False
+    if not is_whole:
+        raise InvalidInput(
+            "checkpoint",
+            got=f"{path}, which is damaged, or holds more than tensors, numbers and text",
+            expected="what an interrupted run left",
+            remedy="start again without --resume",
+        )
+    return content
 
 
 class AtomicCheckpointIO(TorchCheckpointIO):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Iterator
 from copy import deepcopy
 from importlib import import_module
@@ -26,6 +27,7 @@ class LearnedCloth(nn.Module):
         cloth: at its start values; it is changed.
         what: names of the learned parameters. Fields and outputs of a network must belong to the material, or be the
             areal density.
+        network_class: of ``what.network``; None: the class of that name, if it is imported already.
 
     Raises:
         InvalidInput: a name is unknown, or there is nothing to learn.
@@ -34,7 +36,7 @@ class LearnedCloth(nn.Module):
     _places: Tensor
     _pairs: Tensor
 
-    def __init__(self, cloth: Cloth, what: Learn) -> None:
+    def __init__(self, cloth: Cloth, what: Learn, network_class: type[nn.Module] | None = None) -> None:
         super().__init__()
         self.what, self.cloth = what, cloth.requires_grad_(False)
         network_names = [] if what.network is None else what.network.outputs
@@ -53,7 +55,10 @@ class LearnedCloth(nn.Module):
             self.parameter(name).raw = nn.Parameter(self.parameter(name).raw.expand(len(cloth.mesh.faces)).clone())
         for name in (*what.parameters, *what.fields):
             self.parameter(name).raw.requires_grad_(True)
-        self.network = None if what.network is None else _build_network(what.network).to(cloth.areal_density.raw)
+        self.network = None
+        if what.network is not None:
+            network_class = network_class or find_imported_network(what.network.module)
+            self.network = _build_network(what.network, network_class).to(cloth.areal_density.raw)
         if next(self.iterate_with_units(), None) is None:
             expected = "some parameter that may change"
             raise InvalidInput("config: learn.network", got="a network without any", expected=expected)
@@ -162,16 +167,52 @@ def adjacent_triangles(mesh: Mesh) -> Tensor:
     return torch.as_tensor(np.stack([order[:-1][is_same], order[1:][is_same]]) // 3)
 
 
-def _build_network(network: Network) -> nn.Module:
-    where, _, name = network.module.rpartition(".")
+def import_network(name: str) -> type[nn.Module]:
+    """Import the class "package.module.Class" that a user's config names; importing runs the module.
+
+    Raises:
+        InvalidInput: it cannot be imported, or is no subclass of torch.nn.Module.
+    """
+    where, _, attribute = name.rpartition(".")
     try:
-        module = getattr(import_module(where), name)(**network.arguments)
+        found = getattr(import_module(where), attribute)
     except Exception as error:  # the user's code may raise anything
-        expected = "package.module.Class that can be imported and made with the arguments"
+        expected = "package.module.Class that can be imported"
+        raise InvalidInput("config: learn.network", got=f"{name} ({error})", expected=expected) from None
+    return _check_network_class(name, found)
+
+
+def find_imported_network(name: str) -> type[nn.Module]:
+    """Return the class "package.module.Class" of a module that is imported already: a checkpoint imports nothing.
+
+    Raises:
+        InvalidInput: its module is not imported, or it is no subclass of torch.nn.Module.
+    """
+    where, _, attribute = name.rpartition(".")
+    found = vars(sys.modules[where]).get(attribute) if where in sys.modules else None
+    if found is None:
+        raise InvalidInput(
+            "checkpoint: learn.network",
+            got=f"{name}, which is not imported",
+            expected="a class that is imported before the checkpoint is loaded",
+            remedy="import it, or load_from_checkpoint(FILE, network_class=CLASS)",
+        )
+    return _check_network_class(name, found)
+
+
+def _check_network_class(name: str, found: object) -> type[nn.Module]:
+    """Refuse everything but a subclass of nn.Module, before it is called."""
+    if not (isinstance(found, type) and issubclass(found, nn.Module)):
+        raise InvalidInput("config: learn.network", got=name, expected="a subclass of torch.nn.Module")
+    return found
+
+
+def _build_network(network: Network, network_class: type[nn.Module]) -> nn.Module:
+    try:
+        return network_class(**network.arguments)
+    except Exception as error:  # the user's code may raise anything
+        expected = "a class that can be made with the arguments"
         raise InvalidInput("config: learn.network", got=f"{network.module} ({error})", expected=expected) from None
-    if not isinstance(module, nn.Module):
-        raise InvalidInput("config: learn.network", got=network.module, expected="a torch.nn.Module")
-    return module
 
 
 def scalar_summary(values: Tensor) -> float:

@@ -6,7 +6,7 @@ from typing import Any
 
 import lightning.pytorch as pl
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from torchcloth import Cloth
 from torchcloth.episodes.observed_surface import ObservedSurface
@@ -17,6 +17,7 @@ from torchcloth.identification.estimators.objective import Objective
 from torchcloth.identification.residuals.rows import SimulatedEpisode, match_points
 from torchcloth.parameters import call_with_parameters
 
+from .checkpoints import read_checkpoint
 from .cloth_description import build_described_cloth, default_precision
 from .config import from_dict
 from .data import Episodes
@@ -27,27 +28,45 @@ from .losses import Loss, chamfer
 class FitModule(pl.LightningModule):
     """LightningModule of a cloth with learned parameters.
 
-    ``FitModule.load_from_checkpoint(FILE).cloth()`` returns the learned cloth; it needs no data.
+    ``FitModule.load_from_checkpoint(FILE).cloth()`` returns the learned cloth; it needs no data. A network of one's own
+    must be imported before, or be given: ``load_from_checkpoint(FILE, network_class=CLASS)``.
 
     Args:
         config: as in the YAML file.
         description: of the cloth, see ``describe_cloth``.
         problem: fingerprint of the data and of all settings that may not change when a run is resumed.
+        network_class: of ``config``'s network; None: the class of that name, if it is imported already.
     """
 
-    def __init__(self, config: dict[str, Any], description: dict[str, Any], problem: str = "") -> None:
+    def __init__(
+        self,
+        config: dict[str, Any],
+        description: dict[str, Any],
+        problem: str = "",
+        network_class: type[nn.Module] | None = None,
+    ) -> None:
         super().__init__()
-        self.save_hyperparameters(logger=False)
+        self.save_hyperparameters("config", "description", "problem", logger=False)
         self.config, self.problem = from_dict(config), problem
         cloth = build_described_cloth(description, self.config.model)
         with default_precision(self.config.model.precision), torch.random.fork_rng(devices=[]):
             torch.manual_seed(self.config.run.seed)  # a network's first weights
-            self.learned = LearnedCloth(cloth, self.config.learn)
+            self.learned = LearnedCloth(cloth, self.config.learn, network_class)
         self.loss = Loss(self.config.loss)
         self.values_before: dict[str, float] = {}  # before the present step
         self.history: dict[int, dict[str, float]] = {}
         self.sheet: ObservedSurface | None = None
         self.all_have_clouds = False  # every process must log the same keys
+
+    @classmethod
+    def load_from_checkpoint(cls, checkpoint_path: Any, *args: Any, **kwargs: Any) -> FitModule:
+        """Load a checkpoint, as Lightning does; the file holds tensors, numbers and text, or it is refused.
+
+        Raises:
+            InvalidInput: the file holds other objects, or names a network that is not imported.
+        """
+        read_checkpoint(checkpoint_path)
+        return super().load_from_checkpoint(checkpoint_path, *args, **kwargs)
 
     def now(self) -> dict[str, float]:
         """Return the present values by name; of a field, its mean."""

@@ -20,15 +20,16 @@ from lightning.pytorch.strategies import DDPStrategy
 from torch import nn
 
 from torchcloth import Cloth
-from torchcloth._utils.resume import DAMAGED_FILE_ERRORS, digest, source_fingerprint
+from torchcloth._utils.resume import digest, source_fingerprint
 from torchcloth.errors import InvalidInput, MissingDependency
 from torchcloth.identification.estimators.objective import Objective
 
 from . import result
-from .checkpoints import AtomicCheckpointIO
+from .checkpoints import AtomicCheckpointIO, read_checkpoint
 from .cloth_description import build_described_cloth, default_precision, describe_cloth
 from .config import CHECKPOINT, Config, Network, Optimizer, Run
 from .data import Episodes, read_episodes
+from .learned_cloth import import_network
 from .module import FitModule
 from .progress import ProgressPrinter
 
@@ -72,19 +73,7 @@ def fit(config: Config, resume: bool = False) -> FitModule:
 
 
 def _check_checkpoint(checkpoint: Path, steps: int) -> None:
-    try:
-        read_episodes = torch.load(checkpoint, weights_only=True)
-        whole = {"state_dict", "hyper_parameters", "history"} <= read_episodes.keys()
-    except (*DAMAGED_FILE_ERRORS, AttributeError):
-        read_episodes, whole = {}, False
-    if not whole:
-        raise InvalidInput(
-            "--resume",
-            got=f"{checkpoint}, which is damaged",
-            expected="what an interrupted run left",
-            remedy="start again without --resume",
-        )
-    done = len(read_episodes["history"])
+    done = len(read_checkpoint(checkpoint)["history"])
     if done > steps:
         raise InvalidInput("config: optimizer.steps", got=steps, expected=f"at least {done}, the steps already done")
 
@@ -99,7 +88,8 @@ def _run(config: Config, folder: Path, checkpoint: Path | None) -> FitModule:
         got, expected = config.run.processes * config.run.nodes, f"at most {data.per_step}, the episodes at a step"
         raise InvalidInput("config: run.processes", got=got, expected=expected)
     _check_processes(config.run)
-    module = FitModule(asdict(config), description, _problem(config, cloth, data))
+    network_class = None if config.learn.network is None else import_network(config.learn.network.module)
+    module = FitModule(asdict(config), description, _problem(config, cloth, data), network_class)
     _check_statistics(module.learned.network, config.run)
     initial = module.now()
     trainer = _trainer(config, folder, [] if checkpoint else [folder / name for name in result.RESULT_FILES])
