@@ -86,7 +86,7 @@ def test_a_pressed_sheet_slides_and_sticks(pressed):
         shear = (d3.d3 - height[:, None] * n).norm(dim=-1)
         ratio = 5e4 * shear / (0.3 * 1e5 * (1 - pressed.cloth.contact.free_compression - height) ** 2)
         slides.append(ratio > 1 - 1e-9)
-        assert float(height.max()) < 0.89
+        assert float(height.detach().max()) < 0.89
     assert 0 < int(slides[0].sum()) < len(slides[0])
 
 

@@ -285,7 +285,7 @@ def corner_to_vertex_values(faces: np.ndarray, corners: np.ndarray) -> np.ndarra
 def _numbers(name: str, given: ArrayLike, dtype: type | None = np.float64) -> np.ndarray:
     """Return a copy as an array; gradients do not pass through a mesh."""
     try:
-        return np.array(given, dtype=dtype)
+        return np.asarray(given, dtype=dtype).copy()
     except (TypeError, ValueError, RuntimeError) as error:
         expected = "a rectangular array of numbers; triangles, of faces"
         raise InvalidInput(name, got=f"{type(given).__name__} ({error})"[:120], expected=expected) from error

@@ -203,9 +203,9 @@ def look_at(eye: Array, target: Array, up: Array = (0.0, 0.0, 1.0)) -> Array:  #
     """
     eye, target, up = (np.asarray(a, dtype=float) for a in (eye, target, up))
     forward = target - eye
-    right = np.cross(forward, up)
     distance = np.linalg.norm(forward)
-    if not (1e-9 <= distance < np.inf and np.linalg.norm(right) >= 1e-9 * distance):
+    right = np.cross(forward, up) if np.isfinite(distance) else np.zeros(3)
+    if not (distance >= 1e-9 and np.linalg.norm(right) >= 1e-9 * distance):
         raise InvalidInput(
             "target",
             got=target.tolist(),

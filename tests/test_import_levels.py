@@ -1,8 +1,8 @@
-"""Every file imports from its own room or from a floor below; rooms on one floor do not import each other.
+"""Every file imports from its own package or from a level below; packages of one level do not import each other.
 
-A room is a module or package directly under ``torchcloth`` (benchmarks/, robots/, training/ are rooms too, "" is the
-package itself). Imports inside functions and under TYPE_CHECKING count: a circle is one when the code runs, and to a
-reader. Inside a room there is no circle of modules either.
+A package here is a module or folder directly under ``torchcloth`` (benchmarks/, robots/, training/ are packages too, ""
+is the package itself). Imports inside functions and under TYPE_CHECKING count: a circle is one when the code runs, and
+to a reader. Inside a package there is no circle of modules either.
 """
 
 import ast
@@ -14,7 +14,7 @@ import pytest
 ROOT = Path(__file__).resolve().parents[1]
 COMPANIONS = ("benchmarks", "robots", "training")  # folders of their own, installed as torchcloth.robots, ...
 
-FLOORS = (
+LEVELS = (
     ("errors",),
     ("_utils", "schemas"),
     ("types", "parameters", "meshes"),
@@ -36,22 +36,22 @@ FLOORS = (
     ("__main__",),
 )
 
-# Rooms that must know less than their floor allows.
+# Packages that must know less than their level allows.
 ONLY = {
     "robots": {"errors", "types", "recordings", "_utils"},  # tensors cross to the cloth, nothing else
     "recordings": {"errors", "_utils", "schemas", "types", "meshes"},  # an episode can be read without any physics
     "observe": {"errors", "meshes", "losses"},  # it sees where cloth is, and knows nothing of how it moves
 }
 
-# (file, room): reason. An entry that is no longer needed fails the test.
+# (file, package): reason. An entry that is no longer needed fails the test.
 EXCEPTIONS: dict[tuple[str, str], str] = {}
 
 
-def floor(room: str) -> int:
-    for number, rooms in enumerate(FLOORS):
-        if room in rooms:
+def level_of(package: str) -> int:
+    for number, packages in enumerate(LEVELS):
+        if package in packages:
             return number
-    raise AssertionError(f"room {room!r} stands on no floor: place it in FLOORS, above all that it imports")
+    raise AssertionError(f"package {package!r} is on no level: place it in LEVELS, above all that it imports")
 
 
 def sources() -> dict[str, Path]:
@@ -68,8 +68,8 @@ SOURCES = sources()
 NAMES = {name.removesuffix(".__init__") for name in SOURCES}
 
 
-def room_of(name: str) -> str:
-    """Room of a dotted name: torchcloth.robots.arm -> robots, torchcloth.__init__ -> ""."""
+def package_of(name: str) -> str:
+    """Package of a dotted name: torchcloth.robots.arm -> robots, torchcloth.__init__ -> ""."""
     part = [*name.split("."), ""][1]
     return "" if part == "__init__" else part
 
@@ -97,36 +97,36 @@ def imported(name: str, tree: ast.AST) -> Iterator[tuple[int, str]]:
 
 
 def violations(name: str, text: str) -> list[tuple[int, str, str]]:
-    """(line, room, why) for every import in this source that its floor does not allow."""
-    home = room_of(name)
+    """(line, package, why) for every import in this source that its level does not allow."""
+    home = package_of(name)
     bad = []
     for line, target in imported(name, ast.parse(text)):
-        room = room_of(target)
-        if room == home:
+        package = package_of(target)
+        if package == home:
             continue
-        if floor(room) >= floor(home):
-            bad.append((line, room, "sibling" if floor(room) == floor(home) else "floor above"))
-        elif home in ONLY and room not in ONLY[home]:
-            bad.append((line, room, f"{home} may import only {sorted(ONLY[home])}"))
+        if level_of(package) >= level_of(home):
+            bad.append((line, package, "sibling" if level_of(package) == level_of(home) else "level above"))
+        elif home in ONLY and package not in ONLY[home]:
+            bad.append((line, package, f"{home} may import only {sorted(ONLY[home])}"))
     return bad
 
 
-def test_every_room_has_one_floor():
-    rooms = [room for level in FLOORS for room in level]
-    assert len(rooms) == len(set(rooms))
+def test_every_room_has_one_level_of():
+    packages = [package for level in LEVELS for package in level]
+    assert len(packages) == len(set(packages))
     for name in SOURCES:
-        floor(room_of(name))
+        level_of(package_of(name))
 
 
 def test_imports_go_down():
     wrong, used = [], set()
     for name, file in SOURCES.items():
         path = file.relative_to(ROOT).as_posix()
-        for line, room, why in violations(name, file.read_text(encoding="utf-8")):
-            if (path, room) in EXCEPTIONS:
-                used.add((path, room))
+        for line, package, why in violations(name, file.read_text(encoding="utf-8")):
+            if (path, package) in EXCEPTIONS:
+                used.add((path, package))
             else:
-                wrong.append(f"{path}:{line} imports torchcloth{room and '.'}{room} ({why})")
+                wrong.append(f"{path}:{line} imports torchcloth{package and '.'}{package} ({why})")
     assert not wrong, "\n" + "\n".join(wrong)
     assert used == set(EXCEPTIONS), f"exceptions no longer needed: {set(EXCEPTIONS) - used}"
 
@@ -159,9 +159,9 @@ def circles(graph: dict[str, set[str]]) -> list[set[str]]:
     return components
 
 
-def imports_within(room: str) -> dict[str, set[str]]:
-    """Modules of a room, and those of the same room that each imports."""
-    files = {name.removesuffix(".__init__"): name for name in SOURCES if room_of(name) == room}
+def imports_within(package: str) -> dict[str, set[str]]:
+    """Modules of a package, and those of the same package that each imports."""
+    files = {name.removesuffix(".__init__"): name for name in SOURCES if package_of(name) == package}
     return {
         module: {
             target
@@ -172,9 +172,9 @@ def imports_within(room: str) -> dict[str, set[str]]:
     }
 
 
-@pytest.mark.parametrize("room", [room for level in FLOORS for room in level])
-def test_no_circle_inside_a_room(room):
-    components = circles(imports_within(room))
+@pytest.mark.parametrize("package", [package for level in LEVELS for package in level])
+def test_no_circle_inside_a_package(package):
+    components = circles(imports_within(package))
     assert not components, "\n".join(" <-> ".join(sorted(circle)) for circle in components)
 
 
@@ -186,16 +186,16 @@ def test_a_circle_is_seen():
 
 def test_the_walk_sees_the_house():
     """It reads files, and resolves imports that are known to be there."""
-    assert {"", "cloth", "materials", "robots", "training"} <= {room_of(name) for name in SOURCES}
-    rooms = {
-        room_of(target)
+    assert {"", "cloth", "materials", "robots", "training"} <= {package_of(name) for name in SOURCES}
+    packages = {
+        package_of(target)
         for _, target in imported("torchcloth.cloth", ast.parse(SOURCES["torchcloth.cloth"].read_text()))
     }
-    assert {"dynamics", "materials", "boundaries"} <= rooms
+    assert {"dynamics", "materials", "boundaries"} <= packages
 
 
 @pytest.mark.parametrize(
-    ("name", "text", "room"),
+    ("name", "text", "package"),
     [
         ("torchcloth.meshes.mesh", "from ..cloth import Cloth", "cloth"),
         ("torchcloth.effects.air", "from ..materials import AEP", "materials"),
@@ -215,8 +215,8 @@ def test_the_walk_sees_the_house():
         ("torchcloth.__init__", "from . import training", "training"),
     ],
 )
-def test_a_wrong_import_is_found(name, text, room):
-    assert [target for _, target, _ in violations(name, text)] == [room]
+def test_a_wrong_import_is_found(name, text, package):
+    assert [target for _, target, _ in violations(name, text)] == [package]
 
 
 @pytest.mark.parametrize(
