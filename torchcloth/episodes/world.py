@@ -24,8 +24,8 @@ from .observed import Episode
 from .replay import Frames, Replay, frames_from_rollout
 from .user_errors import explain_user_error
 
-RELEVANT_FRACTION = 0.75  # of the smallest amplitude of interest: a fitted amplitude may fall short of the true one
-POSSIBLY_RELEVANT_FRACTION = 0.5  # of the smallest amplitude of interest, for what is confounded with a relevant cause
+RELEVANT_FRACTION = 0.75  # of the smallest effect of interest: a fitted amplitude may fall short of the true one
+POSSIBLY_RELEVANT_FRACTION = 0.5  # of the smallest effect of interest, for what is confounded with a relevant cause
 RESIDUAL_EFFECT_PREFIX = "residual"  # followed by a dot: names of laws that are no causes
 STRAINED_PRIOR_STDS = 3.0  # distance from the data sheet at which a parameter replaces a missing effect
 MAX_CLOCK_DELAY_S = 0.05  # simulations continue for this long after the last frame, for observers with a late clock
@@ -148,7 +148,7 @@ class Hypothesis:
         typical: an amplitude that real recordings have.
         apply: (world, amplitude) -> world.
         signed: whether negative amplitudes make sense.
-        smallest_fraction: smallest amplitude of interest, as a fraction of the typical one.
+        smallest_fraction: smallest effect of interest, as a fraction of the typical one.
         step_fraction: finite step of slopes, as a fraction of the typical amplitude.
         is_applicable: recording -> whether the recording has what the hypothesis needs to mean anything.
         structurally_equivalent: names that no experiment of this kind can separate from it.
@@ -273,7 +273,7 @@ class Hypothesis:
 
     @property
     def smallest_of_interest(self) -> float:
-        """Smallest amplitude of interest, in ``unit``."""
+        """Smallest effect of interest, in ``unit``."""
         return self.smallest_fraction * self.typical
 
     @property

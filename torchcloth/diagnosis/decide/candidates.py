@@ -386,16 +386,12 @@ def accept(
     if not is_improvement(candidate, gain, criteria):
         return False
 
-    # Gate 9, first part. No other motion is clearly less likely with it, unless the equivalent parameter has shifted so
-    # far that nothing else shifts it there.
-    is_shifted = candidate.prior_shift > criteria.max_prior_shift
-    if candidate.is_contradicted and not is_shifted:
-        return False
-
     # Gate 8. Motions agree that the amplitude is not zero, and the mesh error does not explain it. Halves of the sole
     # informative motion need not agree about the size if the gain is overwhelming in both and all other motions stay as
     # they were: creases level off with their rate, and slopes say little there. Halves of such a motion need not agree
-    # about a rival either, because a law that is not quite right differs from early to late.
+    # about a rival either, because a law that is not quite right differs from early to late. Nothing need agree if the
+    # equivalent parameter has shifted so far that nothing else shifts it there.
+    is_shifted = candidate.prior_shift > criteria.max_prior_shift
     index = fitted.model.index_of(candidate.hypothesis.name)
     amplitude, typical = fitted.model.amplitudes[index], fitted.model.accepted[index].typical
     coordinate = len(fitted.model.parameters) + index
@@ -413,8 +409,10 @@ def accept(
     if t_threshold == math.inf or not max(t_threshold * std, Z_95 * abs(candidate.score.mesh_bias)) < abs(mean):
         return False
 
-    # Gate 9, second part. The amplitude is plausible; a fit that ended at zero is no cause. A cause does not stand
-    # alone because its rival is a little too large.
+    # Gate 9. No other motion is clearly less likely with it, and the amplitude is plausible; a fit that ended at zero
+    # is no cause. A cause does not stand alone because its rival is a little too large.
+    if candidate.is_contradicted and not is_shifted:
+        return False
     max_typical = criteria.max_typical_of_rival if role == "rival" else criteria.max_typical
     return 0 < abs(amplitude) < max_typical * abs(typical)
 

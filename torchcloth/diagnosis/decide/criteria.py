@@ -1,7 +1,8 @@
 """Thresholds that decide whether a cause is named, and the gates that apply them.
 
-A candidate is a hypothesis that was fitted. To be named as a cause it passes these gates in this order. Each line names
-the function that applies the gate and the class below that holds its numbers.
+A candidate is a hypothesis that was fitted. To be named as a cause it passes these gates in this order. Gates 2 and 4
+only save work, and gate 7 takes the place of gate 6 for some hypotheses. Each line names the function that applies the
+gate and the class below that holds its numbers.
 
 1.  The score test calls the hypothesis present, or the expected gain of a fit is large: ``candidates.select_likely``
     (``CandidateCriteria``), ``screening.ScoreTest`` (``ScreeningCriteria``).
@@ -19,7 +20,7 @@ the function that applies the gate and the class below that holds its numbers.
 8.  Motions agree that its amplitude is not zero, by more than the mesh error: ``candidates.accept``
     (``CandidateCriteria``).
 9.  No other motion contradicts it, and its amplitude is plausible: ``candidates.accept`` (``CandidateCriteria``).
-10. It is not explained by the hypothesis that it implies: ``candidates.evaluate_candidates`` (``CandidateCriteria``).
+10. It is not explained by the hypothesis that it implies: ``candidates.drop_implied`` (``CandidateCriteria``).
 11. It gains more than its permutations: ``permutation_test.run_permutation_test`` (``PermutationCriteria``).
 12. A further cause explains at least half of the remaining misfit: ``search.search`` (``SearchCriteria``).
 13. It survives backward elimination: ``backward_elimination.replace_by_implied``,
@@ -28,8 +29,9 @@ the function that applies the gate and the class below that holds its numbers.
     (``SearchCriteria``, ``AdequacyCriteria``).
 15. No local force law without a cause predicts much better: ``search.replace_by_law`` (``ResidualLawCriteria``,
     ``SearchCriteria``).
-16. It, or something confounded with it, is relevant: ``search.SearchResult.causes`` (``ConfoundingCriteria``, and
-    ``RELEVANT_FRACTION`` and ``POSSIBLY_RELEVANT_FRACTION`` in ``torchcloth.episodes.world``).
+16. It, or something confounded with it, is relevant, and none of these is irrelevant:
+    ``search.SearchResult.causes`` (``ConfoundingCriteria``, and ``RELEVANT_FRACTION`` and
+    ``POSSIBLY_RELEVANT_FRACTION`` in ``torchcloth.episodes.world``).
 
 If no cause passes, the search starts again from the data sheet (``RestartCriteria``), then from parameters about which
 motions disagree (``HeterogeneityCriteria``). Log densities are natural logarithms.
@@ -38,7 +40,8 @@ Where a study or an archived round set a number, its docstring says so, and ``do
 cases. All other numbers were chosen and not calibrated. These numbers decide as well, and stand with what they
 describe:
 
-- smallest amplitude of interest: ``smallest_fraction`` of ``effects.base.Amplitude`` and ``episodes.world.Hypothesis``;
+- smallest effect of interest: ``effects.base.SMALLEST_FRACTION_OF_TYPICAL``, unless the cause declares its own;
+- how residuals are collected in bins, and which points are outliers: ``data.binning``;
 - ``RELEVANT_FRACTION``, ``POSSIBLY_RELEVANT_FRACTION`` and ``STRAINED_PRIOR_STDS``: ``episodes.world``;
 - ``FINE_MESH_ERROR_FRACTION``, the error of the finer mesh: ``inference.linearise``;
 - prior standard deviations and finite steps of the base model's parameters: ``models.base_model``;
@@ -163,7 +166,7 @@ class BifurcationCriteria:
 
 @dataclass(frozen=True)
 class ScreeningCriteria:
-    """Score test of each hypothesis against its smallest amplitude of interest.
+    """Score test of each hypothesis against its smallest effect of interest.
 
     Attributes:
         min_z_above_smallest: standard errors by which a present amplitude exceeds the smallest one of interest.

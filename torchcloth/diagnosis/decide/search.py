@@ -90,7 +90,7 @@ class SearchResult:
         """Causes that are large enough to be named (gate 16).
 
         The others stay in the model, so that nothing takes their place. Of confounded hypotheses one must be relevant,
-        and all others at least half as large as the smallest amplitude of interest.
+        and all others at least half as large as the smallest effect of interest.
         """
 
         def is_relevant(pairs: list[tuple[Hypothesis, float]]) -> bool:

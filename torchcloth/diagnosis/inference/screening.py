@@ -1,4 +1,4 @@
-"""Score tests: which hypotheses the residuals ask for, compared with the smallest amplitude of interest.
+"""Score tests: which hypotheses the residuals ask for, compared with the smallest effect of interest.
 
 With the whitened slopes J_n along everything that is fitted anyway, and J_j along hypothesis j,
 
