@@ -17,6 +17,7 @@ from torchcloth.episodes.unknowns import collect_unknowns
 from torchcloth.errors import InvalidInput
 from torchcloth.identification import identify
 from torchcloth.identification.estimators.objective import Objective
+from torchcloth.identification.residuals.blocks import select_blocks
 
 POINT = torch.tensor([1.0, 2.0], dtype=torch.float64)
 
@@ -193,6 +194,24 @@ def test_beginnings_of_several_episodes_are_told_apart(recording, tmp_path):
     plain = identify(twins.build_cloth_at(both[0]), both, names, iterations=1)
     stored = identify(twins.build_cloth_at(both[0]), both, names, iterations=1, journal=tmp_path / "journal")
     assert stored.parameters["youngs_modulus"].value == plain.parameters["youngs_modulus"].value
+
+
+def test_distances_of_one_kind_of_data_are_stored(recording, tmp_path):
+    """`identify --use points` once ended in a TypeError here."""
+    cloth = twins.build_cloth_at(recording)
+    distances = []
+    for resumed in (None, False, True):
+        objective = Objective(
+            cloth,
+            collect_unknowns(cloth, ["youngs_modulus"], None),
+            [build_episode(cloth, recording)],
+            blocks=select_blocks("points"),
+        )
+        if resumed is not None:
+            objective.journal = ResumableStore(tmp_path / "j", ["a"], resume=resumed)
+        distances.append(objective.mean_distance(objective.start))
+    assert 0 < distances[0] == distances[1] == distances[2]
+    assert objective.journal.reused_count == 1
 
 
 def test_all_code_that_answers_is_in_the_fingerprint(tmp_path, monkeypatch):

@@ -291,7 +291,8 @@ class Objective:
         if self.uses("points") and self.uses("markers"):
             return self.distance_metrics(raw).chamfer
         self._count_simulations(raw)
-        return float(self._recall("distance", raw, lambda: torch.tensor(self._mean_distance(raw))))
+        (distance,) = self._recall("distance", raw, lambda: (torch.tensor(self._mean_distance(raw)),))
+        return float(distance)
 
     def _mean_distance(self, raw: Tensor) -> float:
         if not self.uses("points", "markers"):
