@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import json
+import os
 import zipfile
 from collections.abc import Mapping
 from pathlib import Path
@@ -13,6 +14,47 @@ import numpy as np
 
 from ..errors import RecordingError
 from . import checks
+
+LFS_POINTER_PREFIX = b"version https://git-lfs.github.com/spec/"  # of the text that stands for a file not fetched
+ANNEX_POINTER_PREFIX = b"/annex/objects/"  # likewise, of an unlocked file of git-annex
+
+
+def is_present(path: Path) -> bool:
+    """Return whether a file or folder exists.
+
+    Raises:
+        RecordingError: the path is a link to nothing, so that data that were recorded would count as absent.
+    """
+    try:
+        if path.exists():
+            return True
+        is_broken_link = path.is_symlink()
+    except (OSError, ValueError):  # a name that no file system can hold
+        return False
+    if is_broken_link:
+        raise RecordingError(
+            f"{path} is a link to nothing",
+            got=f"a link to {os.readlink(path)}",
+            expected="a file or folder",
+            remedy="fetch the data (dvc pull, git annex get, git lfs pull), or copy it with what the link names",
+        )
+    return False
+
+
+def check_fetched(data: bytes, place: str) -> bytes:
+    """Return the bytes of a file, unless they are the placeholder of a file whose data were not fetched.
+
+    Raises:
+        RecordingError: they are a placeholder of git-lfs or git-annex.
+    """
+    for prefix, tool, command in (
+        (LFS_POINTER_PREFIX, "git-lfs", "git lfs pull"),
+        (ANNEX_POINTER_PREFIX, "git-annex", "git annex get"),
+    ):
+        if data.startswith(prefix):
+            got, expected = f"the placeholder of {tool}", "the file's own data"
+            raise RecordingError(f"{place} was not fetched", got=got, expected=expected, remedy=f"run {command}")
+    return data
 
 
 class Folder:
@@ -38,11 +80,12 @@ class Folder:
         return Folder(self.path / name, self.display_path / name)
 
     def has(self, name: str) -> bool:
-        """Return whether a file or folder of this name exists here."""
-        try:
-            return name in self.in_memory or (self.path / name).exists()
-        except (OSError, ValueError):  # a name that no file system can hold
-            return False
+        """Return whether a file or folder of this name exists here.
+
+        Raises:
+            RecordingError: the name is that of a link to nothing.
+        """
+        return name in self.in_memory or is_present(self.path / name)
 
     def read_bytes(self, name: str) -> bytes:
         """Return the bytes of a file that must exist."""
@@ -53,7 +96,7 @@ class Folder:
         if name in self.in_memory:
             return self.in_memory[name]
         try:
-            return (self.path / name).read_bytes()
+            return check_fetched((self.path / name).read_bytes(), place)
         except OSError as error:
             raise RecordingError(f"{place} cannot be read", got=error.strerror, expected="a readable file") from error
 

@@ -16,7 +16,7 @@ import numpy as np
 
 from ..errors import MissingDependency, RecordingError
 from . import checks
-from .files import Folder
+from .files import Folder, check_fetched, is_present
 
 ImageKind = Literal["depth", "color", "mask"]
 IMAGE_KINDS: tuple[ImageKind, ...] = ("depth", "color", "mask")
@@ -88,7 +88,7 @@ class ImageStream:
             if i == len(frames):
                 raise RecordingError(f"{self.kind} images are too many", expected=f"{len(self)}, one for each time")
             if isinstance(image, Path):
-                data = image.read_bytes()
+                data = check_fetched(image.read_bytes(), str(image))
                 self._decode_checked(data, str(image))  # a damaged image is not passed on
                 yield frames[i], image.suffix, data
             else:
@@ -150,13 +150,15 @@ def import_pillow() -> Any:
 def _decode(image: Path | bytes, place: str, *, rgb: bool) -> np.ndarray:
     reader = import_pillow()
     try:
-        data = image if isinstance(image, bytes) else image.read_bytes()
+        data = image if isinstance(image, bytes) else check_fetched(image.read_bytes(), place)
         if data.startswith(PNG_SIGNATURE):
             reader.open(io.BytesIO(data)).verify()  # decoding does not verify the checksums
         with reader.open(io.BytesIO(data)) as opened:
             indexed = "RGBA" if opened.mode in ("P", "PA") else None  # use the palette's colours, not its indices
             mode = "RGB" if rgb else indexed
             return np.asarray(opened if mode is None else opened.convert(mode))
+    except RecordingError:
+        raise
     except Exception as error:  # a damaged image raises whatever its decoder pleases
         raise RecordingError(f"{place} cannot be decoded", got=type(error).__name__, remedy="restore it") from error
 
@@ -205,6 +207,8 @@ def _list(folder: Folder, kind: ImageKind) -> dict[int, Path]:
         paths = [p for p in (folder.path / kind).iterdir() if p.suffix.lower() in _SUFFIXES[kind]]
     except OSError as error:
         raise RecordingError(f"{place} cannot be listed", got=error.strerror, expected="a folder of images") from error
+    for path in paths:
+        is_present(path)
     named = [p for p in paths if p.stem.isdecimal()]
     if not paths or len(named) < len(paths) or len({int(p.stem) for p in named}) < len(paths):
         got = "no image" if not paths else "names that are not distinct frame numbers"

@@ -22,6 +22,7 @@ from pathlib import Path
 
 from ...errors import InvalidInput, RecordingError
 from .. import reading
+from ..files import is_present
 from ..types import Recording
 from .kinect import KINECT_IMPORTER
 from .lerobot import LEROBOT_IMPORTER, LEROBOT_NAME
@@ -54,9 +55,9 @@ def detect_format(path: str | Path) -> str:
     """
     path = Path(path)
     try:
-        if not path.exists():
+        if not is_present(path):
             raise RecordingError(f"{path} does not exist", expected="a recording", remedy="check the path")
-        if path.is_dir() and (path / reading.EPISODE_FILE).is_file():
+        if path.is_dir() and is_present(path / reading.EPISODE_FILE):
             return EPISODE_FOLDER_FORMAT
         name = next((i.name for i in IMPORTERS if i.matches(path)), None)
     except RecordingError:

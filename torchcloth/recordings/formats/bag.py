@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from ...errors import MissingDependency, RecordingError
+from ..files import is_present
 from . import mcap_checksums
 from .imported import report_damage
 
@@ -50,7 +51,7 @@ class Bag:
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        files = [path] if path.is_file() else sorted(p for p in path.iterdir() if p.suffix in STORAGE_SIGNATURES)
+        files = [path] if path.is_file() else storage_files(path)
         coverages = [_verify_file(file) for file in files] or ["none"]
         self.checksums = min(coverages, key=("none", "messages", "all bytes").index)  # that of the least protected file
         self.types, self._store = self._open()
@@ -108,10 +109,15 @@ class Bag:
             return {c.topic: c.msgtype for c in reader.connections}, reader.typestore
 
 
+def storage_files(folder: Path) -> list[Path]:
+    """Return the .mcap and .db3 files of a folder, sorted by name."""
+    return sorted(p for p in folder.iterdir() if p.suffix in STORAGE_SIGNATURES and is_present(p))
+
+
 def is_bag(path: Path) -> bool:
     """Return whether a path is a ROS 2 bag, by its content."""
     if path.is_dir():
-        return (path / METADATA_FILE).is_file()
+        return is_present(path / METADATA_FILE)
     with path.open("rb") as file:
         return file.read(16).startswith(tuple(STORAGE_SIGNATURES.values()))
 

@@ -15,6 +15,7 @@ import numpy as np
 from ...errors import MissingDependency, RecordingError, TorchclothError
 from .. import checks
 from ..checks import Fields
+from ..files import check_fetched, is_present
 from ..images import ImageKind, ImageSource, ImageStream, import_pillow
 
 MAX_SHOWN_CHARACTERS = 60  # of a value in a message
@@ -90,8 +91,9 @@ class FileImages(ImageSource):
 
 def read_bytes(path: Path) -> bytes:
     """Return the bytes of a file that must exist."""
+    is_present(path)
     try:
-        return path.read_bytes()
+        return check_fetched(path.read_bytes(), str(path))
     except (OSError, ValueError) as error:  # ValueError: a name that no file system can hold
         reason = getattr(error, "strerror", None) or error
         raise RecordingError(f"{path} cannot be read", got=reason, expected="a readable file") from error

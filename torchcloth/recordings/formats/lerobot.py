@@ -26,7 +26,7 @@ import numpy as np
 from ...errors import MissingDependency, RecordingError
 from .. import checks
 from ..checks import Fields
-from ..files import Folder
+from ..files import Folder, is_present
 from ..images import ImageStream
 from .imported import NANOSECONDS_PER_SECOND, Imported, ImportedCamera, Importer, reject_unknown_keys, report_damage
 from .scene_file import SceneFile
@@ -47,7 +47,7 @@ FLOAT32_ROUNDING = 2.0**-24  # error per row of a float32 sum; means are compute
 
 def matches(path: Path) -> bool:
     """Return whether a folder has this layout."""
-    return (path / INFO_FILE).is_file()
+    return is_present(path / INFO_FILE)
 
 
 def read(path: Path, scene: SceneFile, episode: int | None) -> Imported:
@@ -101,7 +101,7 @@ def _read_table(file: Path, *, columns: list[str] | None = None, episode: int | 
         from pyarrow import parquet  # pyright: ignore[reportMissingImports]  (optional)
     except ImportError as error:
         raise MissingDependency("reading LeRobot needs pyarrow", remedy='pip install "torchcloth[data]"') from error
-    if not file.is_file():
+    if not is_present(file):
         raise RecordingError(f"{file} is missing", expected="a parquet file", remedy="download it")
     with report_damage(file, "parquet file"):
         rows = None if episode is None else [("episode_index", "=", episode)]
@@ -250,7 +250,7 @@ def _camera(
         raise RecordingError(f"{feature.location('names')} are unclear", got=names, expected="height, width, channels")
     size = shape["width"], shape["height"]
     file = path / _file(info, "video_path", row, f"videos/{key}", video_key=key)
-    if not file.is_file():
+    if not is_present(file):
         raise RecordingError(f"{file} is missing", expected="a video", remedy="download it")
     start = row.get(f"videos/{key}/from_timestamp")
     end = row.get(f"videos/{key}/to_timestamp")

@@ -21,7 +21,7 @@ import numpy as np
 
 from ...errors import RecordingError
 from .. import checks
-from ..files import Folder
+from ..files import Folder, is_present
 from ..images import ImageKind, ImageStream
 from .imported import (
     NANOSECONDS_PER_SECOND,
@@ -51,8 +51,15 @@ _STAMPED_NAME_PATTERN = re.compile(r"\d+-(\d{6,15})")
 
 def matches(path: Path) -> bool:
     """Return whether a folder has this layout."""
-    color = any((path / name).is_dir() for name in COLOR_FOLDERS)
-    return (path / "depth").is_dir() and color and any((path / name).is_file() for name in INTRINSIC_FILES)
+    return (
+        _has_folder(path, "depth")
+        and any(_has_folder(path, name) for name in COLOR_FOLDERS)
+        and any(is_present(path / name) for name in INTRINSIC_FILES)
+    )
+
+
+def _has_folder(path: Path, name: str) -> bool:
+    return is_present(path / name) and (path / name).is_dir()
 
 
 def read(path: Path, scene: SceneFile, episode: int | None) -> Imported:
@@ -72,7 +79,7 @@ def read(path: Path, scene: SceneFile, episode: int | None) -> Imported:
     reject_unknown_keys(source)
     camera, fps = _camera(path, fps)
     camera.calibration.setdefault("depth_scale", scene.depth_scale(name) or REDWOOD_DEPTH_SCALE_M)
-    color = _images(path / next(n for n in COLOR_FOLDERS if (path / n).is_dir()), (".jpg", ".jpeg", ".png"))
+    color = _images(path / next(n for n in COLOR_FOLDERS if _has_folder(path, n)), (".jpg", ".jpeg", ".png"))
     depth = _images(path / "depth", (".png",))
     if len(color) != len(depth):
         got = f"{len(color)} colour and {len(depth)} depth images"
@@ -100,7 +107,7 @@ def read(path: Path, scene: SceneFile, episode: int | None) -> Imported:
     imported = Imported(
         cameras={name: camera}, notes={"format": REDWOOD_NAME, "start_ns": start, "unchecked": REDWOOD_UNCHECKED}
     )
-    log = next((path / n for n in TRAJECTORY_FILES if (path / n).is_file()), None)
+    log = next((path / n for n in TRAJECTORY_FILES if is_present(path / n)), None)
     if log is not None:
         camera.calibration["T_world_camera"] = require_fixed_pose(_poses(log, len(depth)), str(log))
     return imported
@@ -108,7 +115,7 @@ def read(path: Path, scene: SceneFile, episode: int | None) -> Imported:
 
 def _camera(path: Path, fps: float | None) -> tuple[ImportedCamera, float | None]:
     """Intrinsics, and what Open3D's recorders add: the rate and the depth scale."""
-    file = path / next(n for n in INTRINSIC_FILES if (path / n).is_file())
+    file = path / next(n for n in INTRINSIC_FILES if is_present(path / n))
     fields = Folder(file.parent).read_json(file.name)
     flat = fields.array("intrinsic_matrix", 9)
     K = flat.reshape(3, 3).T
@@ -130,7 +137,7 @@ def _camera(path: Path, fps: float | None) -> tuple[ImportedCamera, float | None
 
 
 def _images(folder: Path, suffixes: tuple[str, ...]) -> list[Path]:
-    paths = sorted(p for p in folder.iterdir() if p.is_file())
+    paths = sorted(p for p in folder.iterdir() if is_present(p) and p.is_file())
     wrong = [p for p in paths if p.suffix.lower() not in suffixes]
     if not paths or wrong:
         got = wrong[0].name if wrong else "no image"

@@ -20,6 +20,7 @@ import numpy as np
 
 from ...errors import RecordingError
 from .. import checks
+from ..files import is_present
 from ..images import ImageKind, ImageStream
 from .imported import (
     MAX_SHOWN_CHARACTERS,
@@ -50,7 +51,7 @@ GROUND_TRUTH_FILE = "groundtruth.txt"
 
 def matches(path: Path) -> bool:
     """Return whether a folder has this layout."""
-    return all((path / file).is_file() for file in IMAGE_LIST_FILES.values())
+    return all(is_present(path / file) for file in IMAGE_LIST_FILES.values())
 
 
 def read(path: Path, scene: SceneFile, episode: int | None) -> Imported:
@@ -75,7 +76,7 @@ def read(path: Path, scene: SceneFile, episode: int | None) -> Imported:
     stamps: dict[ImageKind, np.ndarray] = {
         kind: np.array([ns for ns, _ in rows], dtype=np.int64) for kind, rows in lists.items()
     }
-    truth = _truth(path / GROUND_TRUTH_FILE) if (path / GROUND_TRUTH_FILE).is_file() else None
+    truth = _truth(path / GROUND_TRUTH_FILE) if is_present(path / GROUND_TRUTH_FILE) else None
     start = int(min(t[0] for t in stamps.values()))
     numbers: dict[ImageKind, np.ndarray] = {}
     numbers["color"], numbers["depth"] = pair_frames(stamps["color"], stamps["depth"])
