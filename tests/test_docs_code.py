@@ -24,7 +24,12 @@ PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
 BLOCK = re.compile(r"^```python\n(.*?)^```", re.DOTALL | re.MULTILINE)
 PREPARE: dict[str, Callable[[Path], dict[str, Any]]] = {}  # page: files and names that its text assumes
 CHECK: dict[str, Callable[[dict[str, Any]], None]] = {}  # page: what must hold after its blocks
-SLOW_PAGES = {"docs/tutorials/from-depth-images-to-a-fabric.md"}
+SLOW_PAGES = {  # they take ten seconds and more
+    "docs/how-to/simulate-recordings.md",
+    "docs/tutorials/from-depth-images-to-a-fabric.md",
+    "docs/tutorials/plan-an-arm-motion.md",
+    "docs/tutorials/write-your-own-effect.md",
+}
 CLOTH_HEIGHT_M = 0.3  # over the table of the depth images
 HALF_SHEET_M = 0.1
 

@@ -185,6 +185,7 @@ def test_companions_refuse_another_name():
         assert f"import this package as torchcloth.{folder}" in done.stderr
 
 
+@pytest.mark.slow
 def test_the_sdist_makes_the_same_wheel(copy, inside, tmp_path):
     code = f"from setuptools.build_meta import build_sdist; build_sdist({str(tmp_path)!r})"
     call(sys.executable, "-c", code, cwd=copy)

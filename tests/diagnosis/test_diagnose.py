@@ -103,6 +103,7 @@ def test_the_cloud_is_shown_over_both_models_where_the_first_is_farthest_off(wit
     assert "with causes" in figure.axes[-2].get_title()
 
 
+@pytest.mark.slow
 def test_an_amplitude_that_no_world_can_have_ends_a_fit_and_not_the_diagnosis(with_drag):
     recordings, _ = with_drag
     (drag,) = (h for h in asked(recordings) if h.name == "air.drag_n")

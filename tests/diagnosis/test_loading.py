@@ -257,6 +257,7 @@ def test_a_table_that_one_episode_has_is_in_the_scene_of_all(made):
     assert one.rms_after == pytest.approx(other.rms_after, rel=1e-9)
 
 
+@pytest.mark.slow
 def test_the_bases_metres_hardly_depend_on_what_it_is_compared_with(made, tmp_path):
     """Beside the true cause, a third of it, and a wrong one, which fits no better and is not confirmed.
 

@@ -254,6 +254,7 @@ def test_motions_that_differ_by_more_than_noise_disagree(own, told, disagree):
     assert _do_motions_disagree(found, 1, told, list("abcd")) == disagree  # type: ignore[arg-type]
 
 
+@pytest.mark.slow
 def test_motions_of_one_value_disagree_as_often_as_chance_has_it():
     slopes, count = toys.draw_jacobian(1, 3), 300
     found = [

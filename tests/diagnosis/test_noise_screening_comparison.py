@@ -41,6 +41,7 @@ def row(found, name):
     return next(r for r in screen(found) if r.hypothesis.name == name)
 
 
+@pytest.mark.slow
 def test_a_planted_amplitude_is_found_within_its_error():
     z = []
     for seed in range(60):
@@ -51,7 +52,9 @@ def test_a_planted_amplitude_is_found_within_its_error():
     assert 0.75 < float(z.std()) < 1.25
 
 
-@pytest.mark.parametrize("strength", [0.0, 2.5, 4.0])
+@pytest.mark.parametrize(
+    "strength", [pytest.param(0.0, marks=pytest.mark.slow), 2.5, pytest.param(4.0, marks=pytest.mark.slow)]
+)
 def test_power_is_that_of_the_normal_distribution(strength):
     """Beyond t = 2.5 standard errors lie 1 - Phi(t - strength) of the scores of an effect so many of them large."""
     std, count = row(asked([0.0] * 5), "b").std, 100
@@ -453,7 +456,9 @@ def test_two_that_were_fitted_are_alike_where_what_lies_between_them_is_within_t
         assert not are_fits_confounded(moved(1.3 * CRITERIA.confounding.max_chi2 / float(floor) ** 2), found, noise)
 
 
-@pytest.mark.parametrize("stretches", [2, 3, 4])
+@pytest.mark.parametrize(
+    "stretches", [2, pytest.param(3, marks=pytest.mark.slow), pytest.param(4, marks=pytest.mark.slow)]
+)
 def test_intervals_by_stretches_of_time_are_as_wide_as_few_of_them_allow(stretches):
     """Drawn with replacement alone, six episodes of two stretches would surely gain by nothing in 9 % of cases."""
     owner, rng = np.arange(6).repeat(stretches), np.random.default_rng(0)

@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 
+import pytest
 import torch
 from helpers import linear_evidence as toys
 
@@ -31,6 +32,7 @@ def test_a_cause_beats_its_placebos():
         assert found.gain > 20 + 5 * max(found.quantile_95, 0.0)
 
 
+@pytest.mark.slow
 def test_what_is_not_there_seldom_does():
     """Of 30 data without the cause some 5 % may pass by chance: 6 or more would happen once in 300 times."""
     passed = sum(run_permutation_test(with_cause(0.0, seed), MOTIONS, seed=seed).is_passed for seed in range(30))

@@ -97,6 +97,7 @@ def test_it_is_kept_with_the_model_and_can_be_left_out(tmp_path):
     assert torch.equal(left_out.coordinates, plain.coordinates)
 
 
+@pytest.mark.slow
 def test_a_force_that_is_missing_is_learned():
     """Air, of which the model has none, and nothing else; with an answer around it: the slow tests."""
     recordings = recorded(lambda world: world.with_cloth({"air": AirDrag(HIDDEN)}), 0)

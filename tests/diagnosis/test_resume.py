@@ -49,6 +49,7 @@ def counted(monkeypatch):
     return state
 
 
+@pytest.mark.slow
 def test_the_answer_of_a_resumed_diagnosis_is_the_same(episodes, counted, tmp_path):
     asked = [h for h in list_hypotheses(build_base_model(episodes[0]), episodes) if h.name in ASKED]
     search = partial(diagnose, episodes, hypotheses=asked, journal=tmp_path / "progress")

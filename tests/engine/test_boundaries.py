@@ -181,7 +181,7 @@ def test_a_batch_of_ellipses():
 
 
 @pytest.mark.parametrize("law", LAWS)
-@pytest.mark.parametrize("sampling", [None, 0.01])
+@pytest.mark.parametrize("sampling", [None, pytest.param(0.01, marks=pytest.mark.slow)])
 def test_what_bodies_give_with_the_air(law, sampling):
     slope = 0.0 if law == "elliptic" else 0.03  # its axis lies in the plane
     for body in (

@@ -69,7 +69,7 @@ def branches(cloth, state) -> dict[str, int]:
     }
 
 
-@pytest.mark.parametrize("subdivisions", [1, 2])
+@pytest.mark.parametrize("subdivisions", [1, pytest.param(2, marks=pytest.mark.slow)])
 def test_pressed_and_sliding(subdivisions):
     cloth, count = layers(tc.Contact(spacing=SPACING, subdivisions=subdivisions))
     state = pressed(cloth, count)

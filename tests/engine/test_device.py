@@ -49,6 +49,7 @@ def adjoints(job):
     return launch.reverse(job, launch.forward(job)[1], seeds, set(job.inputs))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("meets", [False, True])
 def test_order_of_threads_between_waits_does_not_matter(meets):
     """Bit by bit: nobody reads what another thread of a block writes before both have waited."""
@@ -118,6 +119,7 @@ def folded(cloth):
     return cloth.state(x)
 
 
+@pytest.mark.slow
 def test_layers_that_meet():
     """Folded, pressed by a hand and falling; values and gradients through the cloth."""
     hand = tc.boundaries.Sphere(0.05, (0.0, 0.1, 0.07), moving=True)
@@ -178,7 +180,7 @@ def test_what_it_cannot_do_is_said():
             make_sheet(engine="fused")(make_perturbed_state(make_sheet()), make_opening_motion(TIMES[-1]), TIMES)
 
 
-@pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
+@pytest.mark.parametrize("dtype", [pytest.param(torch.float64, marks=pytest.mark.slow), torch.float32])
 def test_a_device_is_tried_once(dtype, monkeypatch):
     """On a fold that is pressed; one that does something else is not believed."""
     torch.set_default_dtype(dtype)

@@ -139,7 +139,7 @@ def test_all_together_in_a_batch():
 
 
 @pytest.mark.parametrize("air", [False, True], ids=["vacuum", "air"])
-@pytest.mark.parametrize("stages", [2, 5])
+@pytest.mark.parametrize("stages", [2, pytest.param(5, marks=pytest.mark.slow)])
 def test_viscous_forces_in_stages(stages, air):
     effects = {
         **standard(),
@@ -209,6 +209,7 @@ def test_still_and_flat_has_finite_gradients():
     assert all(bool(torch.isfinite(grad).all()) for grad in results.gradients.values() if grad is not None)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["bending friction", "standard"])
 def test_float32_gradients_over_a_thousand_steps(name):
     def made():

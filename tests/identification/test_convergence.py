@@ -70,6 +70,7 @@ def test_without_a_stated_noise_the_way_that_is_left_decides(model, brief):
     assert near.parameters["youngs_modulus"].identifiable
 
 
+@pytest.mark.slow
 def test_a_sheet_between_free_clamps_is_found_from_far_off():
     """Drag and bending, which this pull hardly tells, ask for steps longer than allowed: E must not wait for them."""
     p = sheet(30)

@@ -69,6 +69,7 @@ def share(hits):
     return float(hits.double().mean())
 
 
+@pytest.mark.slow
 def test_intervals_cover_when_noise_is_independent(coverage):
     """600 intervals: 95 % has a sampling error of 0.9 %; the sandwich of 40 frames is a little short or long."""
     assert 0.88 <= share(coverage[0.0]["stated"]) <= 1.0
@@ -113,7 +114,10 @@ def test_nuisances_are_neither_lost_frames_nor_forgotten(shared):
     assert share(error.abs() < 1.96 * stated) >= 0.85
 
 
-@pytest.mark.parametrize(("rows", "unknowns"), [(4, 2), (5, 1), (6, 2), (8, 3)])
+@pytest.mark.parametrize(
+    ("rows", "unknowns"),
+    [(4, 2), pytest.param(5, 1, marks=pytest.mark.slow), (6, 2), pytest.param(8, 3, marks=pytest.mark.slow)],
+)
 def test_few_readings_are_as_uncertain_as_few_are(rows, unknowns):
     """A curve of a tensile test; by the median of what is left alone, intervals held 50 to 80 % of truths."""
     hits, x = [], torch.linspace(0.1, 1, rows, dtype=torch.float64)
@@ -130,7 +134,7 @@ def test_few_readings_are_as_uncertain_as_few_are(rows, unknowns):
     assert 0.9 < share(torch.stack(hits)) < 0.99
 
 
-@pytest.mark.parametrize("rows", [4, 6, 12])
+@pytest.mark.parametrize("rows", [4, pytest.param(6, marks=pytest.mark.slow), pytest.param(12, marks=pytest.mark.slow)])
 def test_few_readings_of_one_kind_are_few_beside_many_of_another(rows):
     """By the number of all, an interval that only four readings tell of held 84 % of truths."""
     many = 600

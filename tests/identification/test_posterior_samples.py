@@ -62,6 +62,7 @@ def test_the_same_seed_draws_the_same(fit):
     assert values(one, names[0]) == values(two, names[0]) != values(other, names[0])
 
 
+@pytest.mark.slow
 def test_an_amplitude_is_drawn_by_its_errors_alone(fit, tmp_path):
     """Those of 1/s and the like had been held within 2.3 of their units."""
     folder, recording, _ = fit

@@ -64,7 +64,7 @@ def result(seed, count, motions=1, strata=None, scatter=True, **options):
     return at.raw - least_squares.TRUE_UNKNOWNS, matrix.diagonal().sqrt()
 
 
-@pytest.mark.parametrize("count", [3, 6])
+@pytest.mark.parametrize("count", [3, pytest.param(6, marks=pytest.mark.slow)])
 def test_intervals_cover_what_differs_between_episodes(count):
     """95 % of 300; without the scatter far fewer, because within an episode all frames agree on a wrong value."""
     covered, blind = [], []
@@ -76,6 +76,7 @@ def test_intervals_cover_what_differs_between_episodes(count):
     assert float(torch.stack(blind).mean()) < 0.75
 
 
+@pytest.mark.slow
 def test_errors_are_those_of_a_mean_of_episodes():
     """Root mean square over seeds: what differs over sqrt n, widened as Student's t for so few."""
     stds = torch.stack([result(seed, 6)[1] for seed in range(60)])

@@ -39,6 +39,7 @@ def swung(tmp_path_factory):
     return replace(made, points=points, observation_noise_std=None)  # its first shape is exact
 
 
+@pytest.mark.slow
 def test_a_light_sheet_that_buckles_is_identified_from_what_can_be_predicted(swung, tmp_path):
     """Started half as stiff again: stiffness and drag to a few per cent, with errors that hold the truth; resumable."""
     model, options = build_cloth(swung), {"iterations": 5, "journal": tmp_path / "journal"}

@@ -156,6 +156,7 @@ def test_a_law_that_stiffens_is_kept_with_its_numbers(tmp_path):
     assert again.material.youngs_modulus.value.item() == pytest.approx(fit.parameters["youngs_modulus"].value)
 
 
+@pytest.mark.slow
 def test_what_specimens_differ_by_widens_the_error():
     """A stiffer one is so along its whole curve: with 5 % between six, the interval held the truth in 60 % of cases."""
     z, stated = [], []

@@ -54,6 +54,7 @@ def test_joints_lead_through_the_recorded_path_and_turn_as_it_does(swing):
     torch.testing.assert_close(again["left"].pose, done["left"].pose)
 
 
+@pytest.mark.slow
 def test_what_is_too_fast_takes_longer_and_what_is_out_of_reach_is_refused(swing):
     usual, hurried = (robots.joint_motion_for_episode(moved(swing, faster=f)) for f in (0.2, 3.0))
     assert usual.slowdown == 1.0 < 1.2 < hurried.slowdown

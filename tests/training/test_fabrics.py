@@ -84,6 +84,7 @@ def test_the_same_trials_distinguish_fabrics(study):
     assert result["E alone"]["margin"] > 10
 
 
+@pytest.mark.slow
 def test_finished_trials_are_not_repeated_and_other_settings_are_refused(study, capsys):
     before = {path: path.stat().st_mtime_ns for path in (study[0] / "cases").iterdir()}
     dtype = torch.get_default_dtype()

@@ -93,6 +93,7 @@ def solved():
     return cases.solve_case(SMALL, manipulations("dress")[2])
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:contact. 100 % of the triangles")  # why: training/studies/manipulations/scenes.py
 def test_a_case_holds_estimates_and_distances(solved):
     assert solved["truth"]["youngs_modulus"] == pytest.approx(129320)

@@ -44,6 +44,7 @@ def oracle(case):
     return hidden_gain._fit(build_oracle(base, truth()), prepare_data(base, recordings))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("amplitude", "low", "high"), [(None, -1e-9, 1e-9), (TRUE, 0.7, 1.0), (0.5 * TRUE, 0.3, 0.7)])
 def test_share_of_the_oracles_gain(case, oracle, monkeypatch, amplitude, low, high):
     """The oracle's fabric is fitted beside the drag, the others' was without it: no 1 can be had here."""

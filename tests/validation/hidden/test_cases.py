@@ -275,6 +275,7 @@ def test_a_sealed_case_is_not_diagnosed_again_and_again(capsys, tmp_path):
     assert not (tmp_path / "cases").exists()
 
 
+@pytest.mark.slow
 def test_visibility_leaves_out_what_the_fabric_can_do():
     """Fast drag moves the cloth by millimetres, which no stiffness can do; weak internal friction hardly moves it."""
     small = replace(draw_case(6, FAST_SIZE), episodes=(case_sampling.EpisodePlan("swing-fast", 0.0, 1.3),))

@@ -86,6 +86,7 @@ def test_dissipation_takes_power_whatever_the_motion(name):
         assert power < 0
 
 
+@pytest.mark.slow
 def test_implicit_damping_is_the_explicit_one_of_short_steps():
     """A strip that swings from a gripper that starts to move, and bends: positions, and the force on the gripper."""
     spec, plate = SheetSpec(0.04, 0.2, nodes=(3, 11)), PlateSpec(stiffness=1e-4, damping_time=0.02)

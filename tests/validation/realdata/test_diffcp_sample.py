@@ -123,6 +123,7 @@ def check_result(folder: Path, printed: str) -> dict[str, float]:
     return fit
 
 
+@pytest.mark.slow
 def test_identify_a_part(source, tmp_path):
     """The first four clouds, one parameter, one iteration: the whole pipeline on measured data."""
     folder, out = tmp_path / "episode", tmp_path / "out"

@@ -108,6 +108,7 @@ def test_fitted_law_reproduces_the_four_curves(measured):
     format_errors(errors)
 
 
+@pytest.mark.slow
 def test_the_result_does_not_depend_on_the_mesh(measured):
     two_angles = {angle: measured[angle] for angle in (30, 45)}
     coarse, fine = (SimulatedMachine(two_angles, resolution).errors(FITTED_VALUES) for resolution in ((41, 5), (61, 7)))
