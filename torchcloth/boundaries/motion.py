@@ -17,6 +17,11 @@ from ..errors import InvalidInput
 from ..types import Trajectory
 from .base import PrescribedMotion
 
+MAX_SAMPLING_INTERVAL_S = (
+    0.12  # knots up to this far apart are samples of a smooth motion (10 Hz), others are waypoints
+)
+MAX_SAMPLING_RATIO = 4.0  # between neighbouring intervals of samples: three lost in a row
+
 
 def check_trajectory(trajectory: Trajectory, name: str) -> None:
     """Check that a trajectory can be followed.
@@ -98,6 +103,7 @@ def check_covers_times(trajectory: Trajectory, name: str, start: float, end: flo
 def interpolate_poses(trajectory: Trajectory, times: Tensor) -> Tensor:
     """Interpolate poses at ``times`` [N] s, [..., N, 4, 4]: cubic Hermite on positions and rotation columns.
 
+    Knots closer than 0.12 s are samples of a smooth motion. Between others the path is monotone: it stays between them.
     Rotations are orthonormalised. The result is C1, so that the gripped cloth sees no velocity jumps at the knots, and
     differentiable in the knots' poses. Times are counted from the first of ``times`` before they are rounded to the
     poses' precision: float32 cannot resolve substeps far from 0.
@@ -151,10 +157,21 @@ def _time_tolerance(t: Tensor) -> float:
 
 
 def _slopes(t: Tensor, value: Tensor) -> Tensor:
-    """Return the derivative at each knot, [..., K, A, B] 1/s: central differences weighted for uneven knots."""
-    h = (t[1:] - t[:-1])[:, None, None]
+    """Return the derivative at each knot, [..., K, A, B] 1/s: that of the parabola through it and its neighbours.
+
+    Beside an interval that is no sampling interval the slopes are monotone (Fritsch and Carlson 1980), so that the path
+    stays between its knots: two knots of a rest say that nothing moves between them. Monotone slopes everywhere would
+    cut off the turning points between samples, by up to 1 mm at 30 Hz for 0.2 m at 1 Hz.
+    """
+    step = t[1:] - t[:-1]
+    h = step[:, None, None]
     secant = (value[..., 1:, :, :] - value[..., :-1, :, :]) / h
     if len(t) == 2:
         return secant.expand_as(value)
-    inner = (h[1:] * secant[..., :-1, :, :] + h[:-1] * secant[..., 1:, :, :]) / (h[1:] + h[:-1])
+    before, after = secant[..., :-1, :, :], secant[..., 1:, :, :]
+    inner = (h[1:] * before + h[:-1] * after) / (h[1:] + h[:-1])
+    bound = torch.where(before * after > 0, 3 * torch.minimum(before.abs(), after.abs()), 0.0)
+    longer, shorter = torch.maximum(step[1:], step[:-1]), torch.minimum(step[1:], step[:-1])
+    is_waypoint = (longer > MAX_SAMPLING_INTERVAL_S) | (longer > MAX_SAMPLING_RATIO * shorter)
+    inner = torch.where(is_waypoint[:, None, None], torch.clamp(inner, -bound, bound), inner)
     return torch.cat([secant[..., :1, :, :], inner, secant[..., -1:, :, :]], dim=-3)
