@@ -439,3 +439,27 @@ def test_vertices_that_a_file_has_split_are_counted():
         tc.Cloth(torn, tc.materials.AEP(1e5), 0.2, contact=None)
     apart = tc.meshes.Mesh.build(vertices + 1e-3 * (np.arange(len(vertices)) > 8)[:, None], faces, vertices[:, :2])
     assert apart.duplicated_vertex_count == 0
+
+
+PLY_SHEET = "element vertex 4\nproperty float x\nproperty float y\nproperty float z\nelement face 3\n"
+PLY_LIST = "property list uchar int vertex_indices\nend_header\n"
+PLY_VERTICES = "0 0 0\n0.1 0 0\n0.1 0.1 0\n0 0.1 0\n"
+
+
+@pytest.mark.parametrize(
+    ("faces", "number"),
+    [("2 0 1\n3 0 1 2\n3 0 2 3\n", 1), ("3 0 1 2\n1 3\n3 0 2 3\n", 2), ("2 0 1\n2 1 2\n2 2 3\n", 1)],
+)
+def test_load_names_a_face_of_fewer_than_three_corners(tmp_path, faces, number):
+    """trimesh drops it, so the cloth would have a hole that the file does not say."""
+    path = tmp_path / "line.ply"
+    path.write_text("ply\nformat ascii 1.0\n" + PLY_SHEET + PLY_LIST + PLY_VERTICES + faces)
+    with pytest.raises(InvalidInput, match=f"line.ply, damaged at face {number} of 3, which has [12] corners"):
+        tc.meshes.load(path)
+
+
+def test_load_reads_an_obj_with_a_byte_order_mark(tmp_path):
+    """As Windows' editors write it; the first line's keyword would be unknown and its vertex lost."""
+    path = tmp_path / "sheet.obj"
+    path.write_text("v 0 0 0\nv 0.1 0 0\nv 0 0.1 0\nf 1 2 3\n", encoding="utf-8-sig")
+    assert tc.meshes.load(path).vertices.tolist() == [[0, 0, 0], [0.1, 0, 0], [0, 0.1, 0]]

@@ -58,6 +58,8 @@ def test_round_trip_is_exact(form):
         ("v 0 0 nan\nv 1 0 0\nv 0 1 0\nf 1 2 3", "v is not finite"),
         ("v 0 0 0\nv 1 0 0\nv 0 1 0\n", "f has the wrong shape"),
         ("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 4", "damaged at line 4"),
+        ("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2\nf 1 2 3", "damaged at line 4; got 'f 1 2'; .*three vertices or more"),
+        ("v 0 0 0\nv 1 0 0\nv 0 1 0\nf\nf 1 2 3", "damaged at line 4; got 'f'"),
         ("v 0 0 0\nv 1 0 0\nv 0 1 0\nv 1 1 0\nf 1 2 3", "a vertex in no face; got vertex 4"),
         ("v 0 0 0\nv 1 0 0\nv 0 1 0\nvt 0\nf 1/1 2/1 3/1", "damaged at line 4; got 'vt 0'"),
     ],

@@ -33,6 +33,8 @@ def parse(text: str, place: str) -> tuple[np.ndarray, np.ndarray, np.ndarray | N
                 vt.append([float(x) for x in items[: VALUES_PER_LINE_KIND[word]]])
             elif word == "f":
                 ring = [_corner(item, len(v), len(vt)) for item in items]
+                if len(ring) < 3:
+                    raise ValueError(f"{len(ring)} corners")
                 if len(ring) > 3:
                     check_convex(np.array([[v[i] for i, _ in ring]]), f"{place}, line {number}")
                 corners += [(ring[0], *pair) for pair in pairwise(ring[1:])]
@@ -42,7 +44,7 @@ def parse(text: str, place: str) -> tuple[np.ndarray, np.ndarray, np.ndarray | N
             raise InvalidInput(
                 f"{place} is damaged at line {number}",
                 got=repr(line[:60]),
-                expected="v X Y Z, vt U V or f with numbers of vertices",
+                expected="v X Y Z, vt U V, or f with numbers of three vertices or more",
             ) from error
     vertices = _rows(v, f"{place}: v", 3)
     index = _rows(corners, f"{place}: f", 3, 2).astype(np.int64)

@@ -91,15 +91,24 @@ def load(path: str | Path) -> Mesh:
 
 
 def _check_polygons(mesh: Any, path: Path) -> None:
-    """Check that polygons are convex: trimesh cuts all into fans."""
+    """Check that polygons have three corners or more and are convex: trimesh drops lines, and cuts into fans."""
     face = (mesh.metadata.get("_ply_raw") or {}).get("face") or {}
     for name in _INDEX & (face.get("properties") or {}).keys():
         corners = _rows(face, name)
+        _check_corner_counts(corners, path)
         groups = [corners] if corners.ndim == 2 else [np.stack(group) for group in _by_corner_count(corners)]
         for polygons in groups:
             if polygons.shape[1] > 3:
                 _check_corners(polygons, len(mesh.vertices), path)
                 obj.check_convex(np.asarray(mesh.vertices)[polygons], str(path))
+
+
+def _check_corner_counts(corners: np.ndarray, path: Path) -> None:
+    counts = [len(row) if np.ndim(row) else 1 for row in corners]
+    few = next((k for k, count in enumerate(counts) if count < 3), None)
+    if few is not None:
+        got = f"{path}, damaged at face {few + 1} of {len(counts)}, which has {counts[few]} corners"
+        raise InvalidInput("mesh file", got=got, expected="faces of three corners or more", remedy="export it again")
 
 
 def _check_corners(polygons: np.ndarray, count: int, path: Path) -> None:
@@ -152,6 +161,6 @@ def _in_metres(mesh: Mesh, path: Path) -> Mesh:
 
 def _read_obj(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
     try:
-        return obj.parse(path.read_text(encoding="utf-8"), str(path))
+        return obj.parse(path.read_text(encoding="utf-8-sig"), str(path))
     except (OSError, UnicodeDecodeError) as error:
         raise InvalidInput("mesh file", got=f"{path} ({error})", expected="a readable OBJ or PLY file") from error
