@@ -7,9 +7,8 @@ compare the two.
 
 from __future__ import annotations
 
-import contextlib
-import io
 import math
+import warnings
 from importlib import resources
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -17,12 +16,15 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from torchcloth.errors import InvalidInput, MissingDependency
+from torchcloth.errors import InvalidInput
 
 from .rigid import origin_matrix
+from .urdf_file import parse_urdf
 
 URDF_FOLDER = Path(str(resources.files("torchcloth.robots"))) / "urdf"
 MOVING_JOINT_TYPES = ("revolute", "continuous", "prismatic")
+MAX_JOINT_LIMIT_RAD = 4 * math.pi  # no joint of an arm turns further
+MAX_JOINT_LIMIT_DEG = 720.0  # likewise; larger limits stand for none
 
 
 class Shape(NamedTuple):
@@ -91,26 +93,6 @@ def locate_urdf(name_or_path: str | Path) -> Path:
         raise InvalidInput("there is no such URDF file", got=path, remedy="check the path")
     expected = f"one of {', '.join(list_models())}, or the path of a URDF file"
     raise InvalidInput("unknown robot name_or_path", got=repr(str(name_or_path)), expected=expected)
-
-
-def parse_urdf(path: Path) -> Any:
-    """Parse a URDF file by pytorch-kinematics (all of its numbers are Python floats).
-
-    Raises:
-        MissingDependency: pytorch-kinematics is not installed.
-        InvalidInput: the file cannot be read.
-    """
-    try:
-        from pytorch_kinematics import URDF
-    except ImportError as error:
-        raise MissingDependency(
-            "robots need pytorch-kinematics, which is not installed", remedy='pip install "torchcloth[robots]"'
-        ) from error
-    try:
-        with contextlib.redirect_stderr(io.StringIO()):  # one line for every vendor tag that it does not know
-            return URDF.from_xml_string(path.read_bytes())
-    except Exception as error:  # the parser raises bare exceptions
-        raise InvalidInput(f"{path} is not a URDF file that can be read", got=error, remedy="mend the file") from error
 
 
 def read_description(path: Path, frame: str) -> Description:
@@ -201,6 +183,7 @@ def _limits(joint: Any) -> tuple[float, ...]:
         raise InvalidInput(f"velocity limit of joint {joint.name!r}", got=velocity, expected="a value > 0")
     if not lower <= upper:
         raise InvalidInput(f"limits of joint {joint.name!r}", got=f"{lower} to {upper}", expected="lower <= upper")
+    _warn_of_strange_limits(joint, lower, upper)
     soft = joint.safety_controller
     if soft is None or soft.soft_lower_limit >= soft.soft_upper_limit:
         return lower, upper, lower, upper, velocity, effort
@@ -211,15 +194,26 @@ def _limits(joint: Any) -> tuple[float, ...]:
     return lower, upper, *within, velocity, effort
 
 
+def _warn_of_strange_limits(joint: Any, lower: float, upper: float) -> None:
+    """Warn of a joint that cannot move, and of limits in degrees: kinematics are right, plans and limits are not."""
+    if lower == upper:
+        text = f"{lower:g} to {upper:g}, so it cannot move; state its limits, or make it continuous or fixed"
+    elif joint.type == "revolute" and MAX_JOINT_LIMIT_RAD < max(abs(lower), abs(upper)) <= MAX_JOINT_LIMIT_DEG:
+        text = f"{lower:g} to {upper:g} rad, which look like degrees; multiply them by pi / 180"
+    else:
+        return
+    warnings.warn(f"limits of joint {joint.name!r} are {text}", stacklevel=2)
+
+
 def _shapes(link: Any, body: int, placed: Tensor) -> list[Shape]:
     """Primitives of a link: its collision shapes, or its visual ones if it has no collision shapes."""
 
     def read(elements: list) -> list[Shape]:
         primitives = [(_primitive(element.geometry), element) for element in elements]
-        for primitive, element in primitives:
+        for primitive, _ in primitives:
             if primitive is not None and not all(0 < size < math.inf for size in primitive[1]):
-                what = f"{primitive[0]} of link {link.name!r}, {element.name!r}" if element.name else link.name
-                raise InvalidInput(f"size of a solid of {what}", got=primitive[1], expected="finite lengths > 0")
+                what = f"size of a {primitive[0]} of link {link.name!r}"
+                raise InvalidInput(what, got=primitive[1], expected="finite lengths > 0")
         return [
             Shape(*primitive, link.name, body, placed @ _matrix(element.origin))
             for primitive, element in primitives
