@@ -93,6 +93,7 @@ class Cloth(nn.Module):
     _points: Tensor
     _vertices: Tensor
     _non_adjacent: Tensor | None
+    _warp_sign: Tensor | None
 
     def __init__(
         self,
@@ -141,6 +142,7 @@ class Cloth(nn.Module):
             "_vertices": torch.tensor(self.mesh.vertices, dtype=dtype),
             "_points": torch.zeros(0, 3, dtype=dtype) if self._grid is None else self._grid.points,
             "_non_adjacent": None if self._grid is None else self._grid.non_adjacent,
+            "_warp_sign": _warp_sign(self.mesh.is_pattern_from_behind, dtype),
         }
         for name, tensor in arrays.items():
             self.register_buffer(name, tensor, persistent=False)
@@ -310,7 +312,7 @@ class Cloth(nn.Module):
             boundaries=dict(self.boundaries.items()),  # type: ignore[arg-type]
             grid=self.contact_grid(),
             inverse_rest_deformation=inverse_rest_deformation(
-                effect.rest_deformation(c) for effect, c in effects.values()
+                (effect.rest_deformation(c) for effect, c in effects.values()), self._warp_sign
             ),
         )
 
@@ -417,3 +419,11 @@ class Cloth(nn.Module):
         except TorchclothError as error:  # a cloth that cannot be simulated is printed to see why
             step, engine = str(error), "none"
         return f"{size}\ncontact: {grid}\nstable step: {step}\nengine: {engine}"
+
+
+def _warp_sign(is_from_behind: np.ndarray, dtype: torch.dtype) -> Tensor | None:
+    """Return -1 where the material axes mirror the pattern, else 1: [E, 1], or [1, 1] if all do; None if none does."""
+    if not is_from_behind.any():
+        return None
+    sign = torch.as_tensor(np.where(is_from_behind, -1.0, 1.0), dtype=dtype).unsqueeze(-1)
+    return sign[:1] if is_from_behind.all() else sign

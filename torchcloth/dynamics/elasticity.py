@@ -56,8 +56,12 @@ def membrane_stress(model: Model, s: Surface, memory: Memory) -> tuple[Tensor, T
     return (p1, p2) if area_share is None else (area_share * p1, area_share * p2)
 
 
-def inverse_rest_deformation(deformations: Iterable[Tensor | None]) -> Tensor | None:
+def inverse_rest_deformation(deformations: Iterable[Tensor | None], warp_sign: Tensor | None) -> Tensor | None:
     """Return A = (G1 G2 ...)^-1 [..., E or 1, 4] by rows, of rest deformations [..., E or 1, 2, 2]; None without any.
+
+    Args:
+        deformations: of the pattern as it is drawn.
+        warp_sign: [E or 1, 1], -1 where the material axes mirror a pattern that is drawn from behind; None: nowhere.
 
     Raises:
         InvalidInput: no area is left.
@@ -69,10 +73,14 @@ def inverse_rest_deformation(deformations: Iterable[Tensor | None]) -> Tensor | 
     if total is None:
         return None
     try:
-        return torch.linalg.inv(total).flatten(-2)
+        inverse = torch.linalg.inv(total).flatten(-2)
     except torch.linalg.LinAlgError as error:  # pyright: ignore[reportPrivateImportUsage]
         got, expected = "a rest shape without area", "shrinkage below 1 and a skew within a right angle"
         raise InvalidInput("rest shape", got=got, expected=expected) from error
+    if warp_sign is None:
+        return inverse
+    one = torch.ones_like(warp_sign)
+    return inverse * torch.cat([one, warp_sign, warp_sign, one], dim=-1)
 
 
 def rest_shape_gradient(gradient: Tensor, inverse: Tensor) -> Tensor:

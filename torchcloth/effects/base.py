@@ -135,7 +135,8 @@ class AbstractEffect(nn.Module, ABC):
     def rest_deformation(self, c: Any) -> Tensor | None:
         """Return the rest deformation [..., E or 1, 2, 2]; None: the pattern is the rest shape.
 
-        Its columns are the pattern's warp and weft in the true rest shape.
+        Its columns are warp and weft of the pattern, as it is drawn, in the true rest shape. They do not depend on the
+        winding of the triangles.
         """
         return None
 

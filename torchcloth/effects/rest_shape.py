@@ -36,8 +36,9 @@ class RestShape(AbstractEffect):
     """The true rest shape after washing or cutting askew: shorter threads than in the pattern, at another angle.
 
     The warp keeps its direction and 1 - shrink_warp of its length. The weft keeps 1 - shrink_weft of its length and
-    leans by ``skew`` towards the warp. The mass is that of the pattern; the material law is per area of the true shape.
-    Bending keeps the pattern's lengths, an error of second order (shrinkage times bending).
+    leans by ``skew`` towards the warp, in the pattern as it is drawn, whatever the winding of the triangles. The mass
+    is that of the pattern; the material law is per area of the true shape. Bending keeps the pattern's lengths, an
+    error of second order (shrinkage times bending).
 
     A law with yarns pulls along right angles of the true shape, so a leaning weft is too soft along itself. With a
     shear modulus of a hundredth of the yarns' modulus the error is 4 % at 0.02 rad and 20 % at 0.05 rad (E / E' = cos^4

@@ -114,6 +114,11 @@ class Mesh:
         )
 
     @property
+    def is_pattern_from_behind(self) -> np.ndarray:
+        """Whether each triangle's pattern is drawn from behind (clockwise), so that ``rest`` mirrors it, [F] bool."""
+        return np.zeros(len(self.faces), bool) if self.pattern is None else signed_area(self.pattern) < 0
+
+    @property
     def piece_count(self) -> int:
         """Number of pieces that have no vertex in common."""
         return topology.count_pieces(self.faces)
