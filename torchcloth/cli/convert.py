@@ -103,6 +103,15 @@ def _with_progress(recording: Recording, write: Any) -> None:
         write(lambda: progress.advance(task))
 
 
+def _describe_depth(image: Any, scale: float) -> str:
+    """Return the unit and the median depth of an image [H, W]."""
+    import numpy as np
+
+    valid = image[image > 0]
+    median = f"a median depth of {float(np.median(valid)) * scale:.3g} m" if len(valid) else "no valid depth"
+    return f"{scale:g} m per unit, {median} in the first image"
+
+
 def _report(recording: Recording, target: Path) -> None:
     from rich.console import Console
     from rich.markup import escape
@@ -114,6 +123,9 @@ def _report(recording: Recording, target: Path) -> None:
         rate_text = "" if rate != rate else f"{rate:.1f}"
         table.add_row(escape(name), content, str(len(t)), f"{t[0]:.3f}", f"{t[-1]:.3f}", rate_text)
     Console(soft_wrap=True).print(table)
+    for name, camera in recording.cameras.items():
+        if camera.depth is not None and camera.depth_scale is not None:
+            print(f"{name}/depth: {_describe_depth(camera.depth.load(0), camera.depth_scale)}")
     source = recording.extra.get("source")
     if isinstance(source, dict) and source.get("unchecked"):
         print(f"no checksum covers {source['unchecked']}: damage there is not detected")

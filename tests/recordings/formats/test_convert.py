@@ -26,6 +26,7 @@ def test_a_folder_becomes_an_episode_and_the_episode_mcap(tmp_path, capsys):
     assert "cam0/depth" in message
     assert "16 x 12 px" in message
     assert "30.0" in message
+    assert "cam0/depth: 0.0002 m per unit, a median depth of 0." in message
     assert call(episode, bag) == 0
     assert call(bag, tmp_path / "back") == 0
     images = [rec.read(p).cameras["cam0"].color for p in (episode, tmp_path / "back")]

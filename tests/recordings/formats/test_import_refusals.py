@@ -10,6 +10,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from helpers import foreign_formats
+from PIL import Image
 
 from torchcloth import recordings as rec
 from torchcloth.errors import InvalidInput, RecordingError
@@ -191,6 +192,22 @@ def test_tum_depth_in_other_units(copy):
     refuse(truth, "units of 0.1 m; got a median depth of 1")
     camera["depth_scale"] = 0.001
     assert formats.read(truth.path, scene=truth.write_scene()).cameras["cam0"].depth_scale == 0.001
+
+
+def test_tum_depth_in_millimetres_is_not_read_as_a_fifth(copy):
+    """1.0 m in millimetres was read as 0.2 m; who has a camera that near says so."""
+    truth = copy("tum")
+    for file in (truth.path / "depth").iterdir():
+        Image.fromarray(np.full((12, 16), 1000, np.uint16)).save(file)
+    refuse(
+        truth,
+        "unit of depth is unclear; got a median depth of 0.2 m, which would be 1 m in millimetres; "
+        ".*depth_scale in the scene: 0.001 for millimetres, or 0.0002",
+    )
+    for scale in (0.001, 0.0002):
+        truth.scene["cameras"]["cam0"]["depth_scale"] = scale
+        camera = formats.read(truth.path, scene=truth.write_scene()).cameras["cam0"]
+        assert camera.depth.load(0).max() * camera.depth_scale == pytest.approx(1000 * scale)
 
 
 def test_masks_without_depth_keep_their_times(copy, tmp_path):

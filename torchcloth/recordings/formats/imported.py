@@ -21,6 +21,8 @@ from ..images import ImageKind, ImageSource, ImageStream, import_pillow
 MAX_SHOWN_CHARACTERS = 60  # of a value in a message
 NANOSECONDS_PER_SECOND = 10**9
 MIN_MEDIAN_DEPTH_M, MAX_MEDIAN_DEPTH_M = 0.05, 30.0
+MIN_DESK_DEPTH_M, MAX_DESK_DEPTH_M = 0.3, 5.0  # median depth of a scene on a desk or before a robot
+MILLIMETRE_DEPTH_SCALE_M = 0.001  # per unit, the most frequent unit of depth images
 MAX_PAIRING_DELAY_NS = 20_000_000  # between two images of one frame, as in TUM's associate.py
 
 
@@ -127,10 +129,30 @@ def image_size(path: Path | bytes) -> tuple[int, int]:
         return image.size
 
 
-def check_depth_scale(depth: ImageStream, scale: float, path: Path) -> None:
-    """Refuse depths that lie beyond any cloth experiment in the assumed unit."""
+def check_depth_scale(depth: ImageStream, scale: float, path: Path, *, is_assumed: bool) -> None:
+    """Refuse depths that lie beyond any cloth experiment in the unit that is taken.
+
+    Args:
+        depth: the images, of which the first is decoded.
+        scale: m per unit.
+        path: the first image, for messages.
+        is_assumed: whether nobody stated the unit. Then depths nearer than a desk are refused if they would be as far
+            as a desk in millimetres.
+
+    Raises:
+        RecordingError: the median depth cannot be in this unit.
+    """
     depth_image = depth.load(0)
-    middle = float(np.median(depth_image[depth_image > 0])) * scale if (depth_image > 0).any() else 1.0
+    units = float(np.median(depth_image[depth_image > 0])) if (depth_image > 0).any() else 1.0 / scale
+    middle, in_millimetres = units * scale, units * MILLIMETRE_DEPTH_SCALE_M
+    if is_assumed and middle < MIN_DESK_DEPTH_M <= in_millimetres <= MAX_DESK_DEPTH_M:
+        got = f"a median depth of {middle:.3g} m, which would be {in_millimetres:.3g} m in millimetres"
+        remedy = (
+            f"set cameras.NAME.depth_scale in the scene: {MILLIMETRE_DEPTH_SCALE_M:g} for millimetres, or {scale:g} if "
+            "the camera is that near"
+        )
+        what = f"{path}: unit of depth is unclear"
+        raise RecordingError(what, got=got, expected=f"units of {scale:g} m", remedy=remedy)
     if not MIN_MEDIAN_DEPTH_M < middle < MAX_MEDIAN_DEPTH_M:
         got, remedy = f"a median depth of {middle:.3g} m", "set cameras.NAME.depth_scale in the scene"
         raise RecordingError(f"{path} is not in units of {scale:g} m", got=got, expected="0.05 to 30 m", remedy=remedy)

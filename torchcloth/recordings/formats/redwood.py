@@ -103,7 +103,7 @@ def read(path: Path, scene: SceneFile, episode: int | None) -> Imported:
         camera.streams[kind] = stream
     if image_size(depth[0]) != size:
         raise RecordingError(f"{depth[0]} has the wrong size", got=image_size(depth[0]), expected=f"{size}")
-    check_depth_scale(camera.streams["depth"], camera.calibration["depth_scale"], depth[0])
+    check_depth_scale(camera.streams["depth"], camera.calibration["depth_scale"], depth[0], is_assumed=False)
     imported = Imported(
         cameras={name: camera}, notes={"format": REDWOOD_NAME, "start_ns": start, "unchecked": REDWOOD_UNCHECKED}
     )

@@ -3,7 +3,8 @@
     rgb.txt, depth.txt    timestamp filename
     groundtruth.txt       timestamp tx ty tz qx qy qz qw    (camera to world; scalar last)
 
-Lines with ``#`` are comments. Depth is in 1/5000 m, unless the scene says otherwise. Colour and depth have separate
+Lines with ``#`` are comments. Depth is in 1/5000 m, unless the scene says otherwise (many
+tools write millimetres: ``depth_scale`` 0.001). Colour and depth have separate
 clock ticks: a colour and a depth image that are each other's nearest within 20 ms share a frame number, and every other
 image has its own. The layout holds no intrinsics: the scene gives them. ``"source": {"trajectory": "left", "closed":
 true}`` reads groundtruth.txt as the path of the gripper "left" instead, for those who track the hand.
@@ -81,12 +82,13 @@ def read(path: Path, scene: SceneFile, episode: int | None) -> Imported:
     numbers: dict[ImageKind, np.ndarray] = {}
     numbers["color"], numbers["depth"] = pair_frames(stamps["color"], stamps["depth"])
     size = image_size(lists["depth"][0][1])
-    scale = scene.depth_scale(name) or TUM_DEPTH_SCALE_M
+    stated_scale = scene.depth_scale(name)
+    scale = stated_scale or TUM_DEPTH_SCALE_M
     camera = ImportedCamera({"width": size[0], "height": size[1], "depth_scale": scale})
     for kind, rows in lists.items():
         source_of = FileImages([file for _, file in rows])
         camera.streams[kind] = ImageStream(kind, numbers[kind], to_seconds(stamps[kind], start), (), size, source_of)
-    check_depth_scale(camera.streams["depth"], scale, lists["depth"][0][1])
+    check_depth_scale(camera.streams["depth"], scale, lists["depth"][0][1], is_assumed=stated_scale is None)
     imported = Imported(
         cameras={name: camera}, notes={"format": TUM_NAME, "start_ns": start, "unchecked": TUM_UNCHECKED}
     )
