@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from torchcloth._utils.torch_modes import disable_autocast
+from torchcloth._utils.vectors import check_is_not_half
 from torchcloth.errors import InvalidInput
 from torchcloth.types import Trajectory
 
@@ -179,6 +180,7 @@ class Arm(SerialChain):
             InvalidInput: sizes that do not match, times that do not increase, or a motion beyond the joints' limits.
         """
         q = self.validate_joints(q)
+        check_is_not_half("t", t)
         t = torch.as_tensor(t).to(q)
         closed, stop = (None if mask is None else torch.as_tensor(mask) for mask in (closed, stop))
         trajectories.check_waypoints(q, t, closed=closed, stop=stop)
@@ -218,6 +220,7 @@ class Arm(SerialChain):
         Raises:
             InvalidInput: names the first pose that cannot be reached and the joints at their limits.
         """
+        check_is_not_half("pose", pose)
         pose = torch.as_tensor(pose).detach().to(self.base)
         if pose.ndim not in (2, 3) or pose.shape[-2:] != (4, 4) or len(pose) == 0:
             raise InvalidInput("pose has the wrong shape", got=tuple(pose.shape), expected="(K, 4, 4) or (4, 4)")
@@ -259,6 +262,7 @@ class Arm(SerialChain):
 
 def _validate_base(base: Tensor, dtype: torch.dtype) -> Tensor:
     base = torch.as_tensor(base)
+    check_is_not_half("base", base)
     if base.requires_grad and base.is_leaf and base.dtype != dtype:  # a copy follows no optimiser
         remedy = "use one precision: load(..., dtype=base.dtype), or base.double()"
         raise InvalidInput("base that is learned", got=base.dtype, expected=f"the arm's {dtype}", remedy=remedy)

@@ -7,6 +7,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor, nn
 
+from torchcloth._utils.vectors import check_is_not_half
 from torchcloth.errors import InvalidInput
 
 from .description import Description
@@ -84,7 +85,7 @@ class SerialChain(nn.Module):
         """Return joint positions ``[..., J]`` in the precision of the chain.
 
         Raises:
-            InvalidInput: another number of joints, integers, or a chain in half precision.
+            InvalidInput: another number of joints, integers, or joints or a chain in half precision.
         """
         q = torch.as_tensor(q)  # recordings hold arrays
         joints = len(self.joint_names)
@@ -96,6 +97,7 @@ class SerialChain(nn.Module):
         if self.base.dtype not in (torch.float32, torch.float64):
             got = str(self.base.dtype).removeprefix("torch.")
             raise InvalidInput("precision of the arm", got=got, expected="float32 or float64", remedy="use arm.float()")
+        check_is_not_half(name, q)
         return q.to(self.base)
 
     def body_poses(self, q: Tensor) -> Tensor:

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor, nn
 from torch.func import functional_call
 
-from ._utils.vectors import check_has_no_gradient
+from ._utils.vectors import check_has_no_gradient, check_is_not_half
 from .errors import InvalidInput
 
 Domain = Literal["positive", "unit_half", "nonnegative", "real"]
@@ -56,7 +56,7 @@ class PhysicalParameter(nn.Module):
         bounds: open interval of a "real" parameter. The cloth raises an error after an optimiser step that leaves it.
 
     Raises:
-        InvalidInput: no number or tensor, outside the domain or not finite.
+        InvalidInput: no number or tensor, half precision, outside the domain or not finite.
     """
 
     def __init__(
@@ -128,6 +128,7 @@ class PhysicalParameter(nn.Module):
 
     def _to_raw(self, value: float | Tensor, dtype: torch.dtype | None = None) -> Tensor:
         check_has_no_gradient(self.label, value)
+        check_is_not_half(self.label, value)
         try:
             tensor = torch.as_tensor(value, dtype=None if isinstance(value, Tensor) else torch.float64).detach().clone()
         except (TypeError, ValueError, RuntimeError) as error:

@@ -9,6 +9,7 @@ from helpers.small_sheet import make_sheet
 
 import torchcloth as tc
 from torchcloth.boundaries import sample_trajectory
+from torchcloth.boundaries.motion import check_trajectory
 from torchcloth.dynamics import substep
 from torchcloth.errors import InvalidInput, SimulationDiverged, UnstableStep
 
@@ -258,6 +259,25 @@ def test_half_precision_is_refused(dtype):
         cloth = make_sheet(contact=contact).to(dtype)
         with pytest.raises(InvalidInput, match=r"precision of the cloth; got .*float16; expected float32 or float64"):
             cloth(cloth.rest_state(), times=(0.0, 1e-3))
+
+
+def test_inputs_in_half_precision_are_refused():
+    cloth, half = make_sheet(), torch.bfloat16
+    x = cloth.rest_state().x
+    times = torch.tensor([0.0, 1.0])
+    pose, closed = torch.eye(4).repeat(2, 1, 1), torch.ones(2, dtype=torch.bool)
+    raw = {"areal_density.raw": cloth.areal_density.raw.detach().to(half)}
+    for name, call in {
+        "x": lambda: cloth.state(x.to(half)),
+        "v": lambda: cloth.state(x, x.to(half)),
+        "times": lambda: cloth(cloth.rest_state(), times=times.to(half)),
+        "areal_density.raw": lambda: torch.func.functional_call(cloth, raw, (cloth.rest_state(),)),
+        "areal_density": lambda: tc.Cloth(cloth.mesh, cloth.material, torch.tensor(0.2, dtype=half)),
+        r"motion\['hand'\].t": lambda: check_trajectory(tc.Trajectory(times.to(half), pose, closed), "hand"),
+        r"motion\['hand'\].pose": lambda: check_trajectory(tc.Trajectory(times, pose.to(half), closed), "hand"),
+    }.items():
+        with pytest.raises(InvalidInput, match=f"precision of {name}; got bfloat16; expected float32 or float64"):
+            call()
 
 
 @pytest.mark.parametrize("duration", [0.0, -1.0, math.nan])

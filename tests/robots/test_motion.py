@@ -129,6 +129,24 @@ def test_refuses_half_the_digits(arm):
         copy.deepcopy(arm).half()(arm.home)
 
 
+@pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16])
+def test_refuses_joints_that_are_rounded_by_millimetres(arm, waypoints, dtype):
+    """Reported: the pose of joints in bfloat16 is up to 10.5 mm off, without a word."""
+    rounded = waypoints.to(dtype)
+    pose = arm(waypoints)
+    for name, call in {
+        "q": lambda: arm(rounded),
+        "t": lambda: arm.motion(waypoints, torch.as_tensor(TIMES).to(dtype)),
+        "pose": lambda: arm.inverse(pose.to(dtype)),
+        "q0": lambda: arm.inverse(pose, rounded[0]),
+        "base": lambda: robots.load("rizon4", base=torch.eye(4, dtype=dtype)),
+    }.items():
+        with pytest.raises(InvalidInput, match=rf"precision of {name}; got b?float16; expected float32 or float64"):
+            call()
+    with pytest.raises(InvalidInput, match="precision of q; got float16"):
+        arm(waypoints.numpy().astype("float16"))
+
+
 def test_refuses_what_does_not_match(arm, waypoints):
     def refused(match, q=waypoints, t=TIMES, **options):
         with pytest.raises(InvalidInput, match=match):

@@ -10,6 +10,8 @@ from torch import Tensor
 
 from ..errors import InvalidInput
 
+HALF_PRECISIONS = ("float16", "bfloat16", "float8")  # how the names of such types begin, in torch and numpy
+
 
 def parse_unit_vector(what: str, given: Sequence[float]) -> Tensor:
     """Return the given direction as a unit vector [3].
@@ -46,6 +48,7 @@ def parse_finite_numbers(what: str, given: Sequence[float], count: int, expected
         InvalidInput: another count, no numbers, or numbers that are not finite.
     """
     check_has_no_gradient(what, given)
+    check_is_not_half(what, given)
     try:
         vector = torch.as_tensor(given, dtype=torch.get_default_dtype())
     except (TypeError, ValueError, RuntimeError) as error:
@@ -53,6 +56,18 @@ def parse_finite_numbers(what: str, given: Sequence[float], count: int, expected
     if vector.shape != (count,) or not bool(torch.isfinite(vector).all()):
         raise InvalidInput(what, got=given, expected=expected)
     return vector
+
+
+def check_is_not_half(what: str, given: object) -> None:
+    """Refuse a tensor or an array in half precision, whose rounding is millimetres at one metre.
+
+    Raises:
+        InvalidInput: 16 bits or fewer.
+    """
+    dtype = str(getattr(given, "dtype", "")).removeprefix("torch.")
+    if dtype.startswith(HALF_PRECISIONS):
+        remedy = "it is rounded by millimetres at one metre already: compute it in float32, outside autocast"
+        raise InvalidInput(f"precision of {what}", got=dtype, expected="float32 or float64", remedy=remedy)
 
 
 def check_has_no_gradient(what: str, given: object) -> None:

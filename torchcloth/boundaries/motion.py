@@ -13,6 +13,7 @@ from torch import Tensor
 
 from .._utils.caching import LRUCache, bytes_of
 from .._utils.linalg import cross, dot, find_last_knot, interpolate_hermite
+from .._utils.vectors import check_is_not_half
 from ..errors import InvalidInput
 from ..types import Trajectory
 from .base import PrescribedMotion
@@ -27,8 +28,8 @@ def check_trajectory(trajectory: Trajectory, name: str) -> None:
     """Check that a trajectory can be followed.
 
     Raises:
-        InvalidInput: wrong shapes or time order, ``closed`` that is not bool, poses that are not finite, or turns of
-            over 90 degrees between knots.
+        InvalidInput: wrong shapes or time order, ``closed`` that is not bool, poses that are not finite, half
+            precision, or turns of over 90 degrees between knots.
     """
     where = f"motion[{name!r}]"
     if not isinstance(trajectory, Trajectory) or not all(isinstance(part, Tensor) for part in trajectory):
@@ -52,6 +53,8 @@ def _check(trajectory: Trajectory, where: str) -> None:
     if closed.dtype != torch.bool:
         got, remedy = str(closed.dtype).removeprefix("torch."), "for example closed > 0.5"
         raise InvalidInput(f"{where}.closed", got=got, expected="bool", remedy=remedy)
+    for name, tensor in (("t", t), ("pose", pose)):
+        check_is_not_half(f"{where}.{name}", tensor)
     if not t.is_floating_point() or not bool(torch.isfinite(t).all()):
         got = "NaN or infinite times" if t.is_floating_point() else str(t.dtype).removeprefix("torch.")
         raise InvalidInput(f"{where}.t", got=got, expected="finite seconds, floating point")

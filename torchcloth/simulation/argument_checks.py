@@ -8,6 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+from .._utils.vectors import check_is_not_half
 from ..boundaries import AbstractBoundary, Grasp
 from ..boundaries.motion import check_covers_times
 from ..boundaries.motion import check_trajectory as check_motion
@@ -147,6 +148,7 @@ def check_times(times: Tensor | Sequence[float]) -> list[float]:
     if isinstance(times, Tensor) and times.requires_grad and torch.is_grad_enabled():
         remedy = "times.detach(); gradients by when a motion happens are those by its Trajectory.t"
         raise InvalidInput("times", got="a tensor that wants gradients", expected="frame times, fixed", remedy=remedy)
+    check_is_not_half("times", times)
     try:
         flat = torch.as_tensor(times, dtype=torch.float64)
     except (TypeError, ValueError, RuntimeError) as error:
@@ -169,6 +171,7 @@ def check_parameters(cloth: nn.Module) -> None:
     check_axes(cloth.mesh, {"material": cloth.material, **effects})  # type: ignore[arg-type, dict-item]
     check_grasps(effects, cloth.boundaries)  # type: ignore[arg-type]
     for name, parameter in cloth.named_parameters():
+        check_is_not_half(name, parameter)
         if bool(parameter.isnan().any()):
             raise InvalidInput(name, got="NaN", expected="a number", remedy="look at the optimiser's last step")
     for name, part in cloth.named_modules():
@@ -256,6 +259,7 @@ def check_motions(
 
 def as_positions(name: str, given: object, like: Tensor) -> Tensor:
     """Return positions or velocities [..., V, 3] as a tensor of the type and device of ``like``."""
+    check_is_not_half(name, given)
     try:
         return torch.as_tensor(given, dtype=like.dtype, device=like.device)  # type: ignore[arg-type]
     except (TypeError, ValueError, RuntimeError) as error:
