@@ -100,6 +100,26 @@ def test_pickle_deepcopy_and_state_dict(value):
     assert pickle.loads(pickle.dumps(parameter)).unit == "Pa"
 
 
+@pytest.mark.parametrize(("stored", "present"), [(4, None), (None, 4), (4, 5), (1, 4)], ids=str)
+def test_a_checkpoint_of_another_shape_is_refused(stored, present):
+    """Reported: until torch 2.9 the field's first triangle became the value of all."""
+    fields = [2.0 if n is None else torch.linspace(1.0, 2.0, n) for n in (stored, present)]
+    part, other = (torch.nn.ModuleDict({"stiffness": tc.PhysicalParameter(field, "Pa")}) for field in fields)
+    before = other["stiffness"].value.detach().clone()
+    for assign in (False, True):
+        with pytest.raises(
+            RuntimeError, match=r"stiffness.raw; got shape \(.*\); expected shape \(.*\); build the cloth"
+        ):
+            other.load_state_dict(part.state_dict(), assign=assign)
+    assert torch.equal(other["stiffness"].value, before)
+
+
+def test_a_checkpoint_of_one_entry_is_a_number():
+    number = tc.PhysicalParameter(7.0, "Pa")
+    number.load_state_dict(tc.PhysicalParameter(torch.tensor([3.0]), "Pa").state_dict())
+    assert float(number.value.detach()) == pytest.approx(3.0)
+
+
 def test_precision():
     parameter = tc.PhysicalParameter(1e5, "Pa")
     assert parameter.raw.dtype == torch.float64

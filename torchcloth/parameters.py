@@ -126,6 +126,16 @@ class PhysicalParameter(nn.Module):
         if self.domain == "nonnegative":
             self.raw.clamp_(min=0.0)
 
+    def _load_from_state_dict(self, state_dict: Mapping[str, Any], prefix: str, *arguments: Any) -> None:
+        """Load ``raw``, and refuse another shape: until 2.9 torch takes a field's first entry for a number."""
+        stored, error_messages = state_dict.get(f"{prefix}raw"), arguments[-1]
+        if isinstance(stored, Tensor) and stored.shape != self.raw.shape and (self.raw.ndim, stored.shape) != (0, (1,)):
+            got, expected = (f"shape {tuple(tensor.shape)}" for tensor in (stored, self.raw))
+            remedy = "build the cloth with a field, or a number, as it was when the checkpoint was written"
+            error_messages.append(str(InvalidInput(f"{prefix}raw", got=got, expected=expected, remedy=remedy)))
+            return
+        super()._load_from_state_dict(state_dict, prefix, *arguments)
+
     def _to_raw(self, value: float | Tensor, dtype: torch.dtype | None = None) -> Tensor:
         check_has_no_gradient(self.label, value)
         check_is_not_half(self.label, value)
