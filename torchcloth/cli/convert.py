@@ -127,6 +127,8 @@ def _report(recording: Recording, target: Path) -> None:
         if camera.depth is not None and camera.depth_scale is not None:
             print(f"{name}/depth: {_describe_depth(camera.depth.load(0), camera.depth_scale)}")
     source = recording.extra.get("source")
+    for note in source.get("repairs", ()) if isinstance(source, dict) else ():
+        print(f"note: {note}")
     if isinstance(source, dict) and source.get("unchecked"):
         print(f"no checksum covers {source['unchecked']}: damage there is not detected")
     print(f"written: {target}")

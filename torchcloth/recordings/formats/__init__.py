@@ -4,7 +4,7 @@
     recordings.write(recording, "episodes/ep_01")
 
 ============================  ==========================================
-ROS 2 bags                    ``ros2`` (folders, .mcap and .db3 files)
+ROS bags                      ``ros2`` (folders, .mcap, .db3 and .bag files)
 LeRobot v3                    ``lerobot``
 Azure Kinect .mkv             ``kinect``
 Open3D/Redwood RGB-D folders  ``redwood``

@@ -1,10 +1,11 @@
-"""Reader of ROS 2 bags (a rosbag2 folder, or one .mcap or .db3 file), by rosbags."""
+"""Reader of ROS bags (a rosbag2 folder, one .mcap or .db3 file, or a .bag file of ROS 1), by rosbags."""
 
 from __future__ import annotations
 
 import re
 from collections import Counter
 from collections.abc import Iterator, Sequence
+from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -15,6 +16,7 @@ from .imported import report_damage
 
 SQLITE_SIGNATURE = b"SQLite format 3\x00"
 STORAGE_SIGNATURES = {".mcap": mcap_checksums.MCAP_SIGNATURE, ".db3": SQLITE_SIGNATURE}
+ROS1_SIGNATURE, ROS1_SUFFIX = b"#ROSBAG V2.0", ".bag"
 METADATA_FILE = "metadata.yaml"
 
 
@@ -35,12 +37,13 @@ class BagMessage(NamedTuple):
 
 
 class Bag:
-    """A ROS 2 bag whose checksums and counts are verified.
+    """A ROS bag whose checksums and counts are verified.
 
     Args:
-        path: a rosbag2 folder, or a .mcap or .db3 file.
+        path: a rosbag2 folder, or a .mcap, .db3 or .bag file.
 
     Attributes:
+        notes: what was mended.
         checksums: what the bag's checksums cover: "all bytes", "messages" or "none".
         types: message types by topic.
 
@@ -50,9 +53,13 @@ class Bag:
     """
 
     def __init__(self, path: Path) -> None:
+        self.notes: list[str] = []
         self.path = path
         files = [path] if path.is_file() else storage_files(path)
-        coverages = [_verify_file(file) for file in files] or ["none"]
+        if path.is_dir() and not is_present(path / METADATA_FILE):
+            self.path = self._only_storage_file(files)
+        self.is_ros1 = self.path.suffix == ROS1_SUFFIX
+        coverages = ["none"] if self.is_ros1 else [_verify_file(file) for file in files] or ["none"]
         self.checksums = min(coverages, key=("none", "messages", "all bytes").index)  # that of the least protected file
         self.types, self._store = self._open()
 
@@ -62,10 +69,10 @@ class Bag:
         Raises:
             RecordingError: messages are missing or damaged.
         """
-        from rosbags.rosbag2 import Reader  # pyright: ignore[reportMissingImports]  (optional)
+        from rosbags import rosbag1, rosbag2  # pyright: ignore[reportMissingImports]  (optional)
 
-        with report_damage(self.path, "ROS 2 bag"):
-            reader = Reader(self.path)
+        with self._report_damage():
+            reader: Any = rosbag1.Reader(self.path) if self.is_ros1 else rosbag2.Reader(self.path)
             reader.open()
         try:
             wanted = [c for c in reader.connections if c.topic in topics]
@@ -85,14 +92,32 @@ class Bag:
     def _deserialized(self, reader: Any, wanted: list[Any], seen: Counter[str]) -> Iterator[BagMessage]:
         stream: Iterator[Any] = reader.messages(connections=wanted) if wanted else iter(())
         while True:
-            with report_damage(self.path, "ROS 2 bag"):
+            with self._report_damage():
                 message = next(stream, None)
                 if message is None:
                     return
                 connection, logged, raw = message
                 place = f"{self.path}: {connection.topic}[{seen[connection.topic]}]"
-                body = self._store.deserialize_cdr(raw, connection.msgtype)
+                deserialize = self._store.deserialize_ros1 if self.is_ros1 else self._store.deserialize_cdr
+                body = deserialize(raw, connection.msgtype)
             yield BagMessage(connection.topic, int(logged), body, place)
+
+    def _report_damage(self) -> AbstractContextManager[None]:
+        if self.is_ros1:
+            return report_damage(self.path, "ROS 1 bag", remedy="reindex it (rosbag reindex), or copy it again")
+        return report_damage(self.path, "ROS 2 bag")
+
+    def _only_storage_file(self, files: list[Path]) -> Path:
+        """The storage file of a folder without metadata, as a killed recorder leaves it."""
+        if len(files) != 1:
+            raise RecordingError(
+                f"{self.path / METADATA_FILE} is missing",
+                got=f"{len(files)} storage files",
+                expected="the list of the files and their messages",
+                remedy=f"write it: ros2 bag reindex {self.path}",
+            )
+        self.notes.append(f"{METADATA_FILE} is missing, so {files[0].name} was read; ros2 bag reindex writes it")
+        return files[0]
 
     def _open(self) -> tuple[dict[str, str], Any]:
         """Types by topic, and the definitions of all types, from the bag or else of ROS 2 Humble."""
@@ -100,10 +125,10 @@ class Bag:
             from rosbags.highlevel import AnyReader  # pyright: ignore[reportMissingImports]  (optional)
             from rosbags.typesys import Stores, get_typestore  # pyright: ignore[reportMissingImports]
         except ImportError as error:
-            message = "reading ROS 2 bags needs rosbags"
+            message = "reading ROS bags needs rosbags"
             raise MissingDependency(message, remedy='pip install "torchcloth[data]"') from error
         with (
-            report_damage(self.path, "ROS 2 bag"),
+            self._report_damage(),
             AnyReader([self.path], default_typestore=get_typestore(Stores.ROS2_HUMBLE)) as reader,
         ):
             return {c.topic: c.msgtype for c in reader.connections}, reader.typestore
@@ -115,11 +140,14 @@ def storage_files(folder: Path) -> list[Path]:
 
 
 def is_bag(path: Path) -> bool:
-    """Return whether a path is a ROS 2 bag, by its content."""
+    """Return whether a path is a ROS bag, by its content."""
     if path.is_dir():
-        return is_present(path / METADATA_FILE)
+        has_only_files = not any(p.is_dir() for p in path.iterdir())
+        return is_present(path / METADATA_FILE) or (has_only_files and bool(storage_files(path)))
     with path.open("rb") as file:
-        return file.read(16).startswith(tuple(STORAGE_SIGNATURES.values()))
+        head = file.read(16)
+    is_ros1 = head.startswith(ROS1_SIGNATURE) and path.suffix == ROS1_SUFFIX
+    return is_ros1 or head.startswith(tuple(STORAGE_SIGNATURES.values()))
 
 
 def _verify_file(file: Path) -> mcap_checksums.ChecksumCoverage:

@@ -14,9 +14,10 @@ from .. import streams
 from ..files import Folder
 from .bag import Bag
 from .imported import Imported, report_damage
+from .ros2_topics import SCENE_TOPIC
 from .scene_file import SceneFile
 
-SCENE_TOPIC, FILES_TOPIC = "/torchcloth/scene", "/torchcloth/files"
+FILES_TOPIC = "/torchcloth/files"
 EXTRA_ARRAYS_FILE = "extra.npz"
 
 

@@ -158,6 +158,36 @@ def check_depth_scale(depth: ImageStream, scale: float, path: Path, *, is_assume
         raise RecordingError(f"{path} is not in units of {scale:g} m", got=got, expected="0.05 to 30 m", remedy=remedy)
 
 
+def order_by_stamp(stamps: Sequence[int], contents: Sequence[bytes], place: str) -> tuple[np.ndarray, list[str]]:
+    """Order messages by their stamps, without those that repeat the stamp and the content of another.
+
+    Args:
+        stamps: [N] ns, as recorded.
+        contents: the content of each message, or a digest of it.
+        place: where the messages are from, for the notes.
+
+    Returns:
+        Indices of the messages to use, and notes on what was changed. Two messages of one stamp with different contents
+        both stay: the check of the times refuses them.
+    """
+    order = sorted(range(len(stamps)), key=lambda i: stamps[i])
+    seen: dict[int, set[bytes]] = {}
+    chosen = []
+    for i in order:
+        known = seen.setdefault(stamps[i], set())
+        if contents[i] not in known:
+            chosen.append(i)
+        known.add(contents[i])
+    notes = []
+    if len(chosen) < len(stamps):
+        notes.append(f"{place}: {len(stamps) - len(chosen)} of {len(stamps)} messages were there twice, one is used")
+    times = np.array(stamps, dtype=np.int64)
+    late = int((times < np.maximum.accumulate(times)).sum()) if len(times) else 0
+    if late:
+        notes.append(f"{place}: {late} of {len(stamps)} messages were out of order, sorted by header.stamp")
+    return np.array(chosen, dtype=np.int64), notes
+
+
 def to_seconds(nanoseconds: Sequence[int] | np.ndarray, start: int) -> np.ndarray:
     """Return times [N] s since ``start``, each the float64 nearest to its integer nanoseconds."""
     return (np.asarray(nanoseconds, dtype=np.int64) - start) / NANOSECONDS_PER_SECOND

@@ -1,4 +1,4 @@
-"""ROS 2 bags are read here: rosbag2 folders, .mcap and .db3 files. The scene says what each topic is.
+"""ROS bags are read here: rosbag2 folders, .mcap, .db3 and .bag files. The scene says what each topic is.
 
     "source": {
       "motion": {"left": {"pose": "/left/pose", "closed": "/left/closed" | true, "wrench": "/left/ft",
@@ -11,12 +11,14 @@
 Poses, clouds and wrenches must be in the frame world or map, or their ``frame`` names a camera or robot that the scene
 places. Times are those of measurement (header.stamp), relative to ``epoch`` [ns] or to the earliest one used. Messages
 without a header (std_msgs) are placed by their time of logging. Wrenches are interpolated between messages; ``closed``
-is constant until the next message.
+is constant until the next message. A message that repeats another one's stamp and content is left out, and messages out
+of order are sorted by their stamps; ``source.repairs`` in the episode says so.
 
 Checksums: in an MCAP file with checksums of its sections (our own writer's) any changed byte is detected. With
-checksums of its chunks (as ROS 2 and the MCAP libraries write them) any changed message is. MCAP files by rosbags and
-all sqlite files carry none: structure, counts and times are checked, but a changed number or pixel goes unnoticed if it
-stays plausible. ``source.checksums`` in the episode says which it was: "all bytes", "messages" or "none".
+checksums of its chunks (as ROS 2 and the MCAP libraries write them) any changed message is. MCAP files by rosbags, all
+sqlite files and bags of ROS 1 carry none: structure, counts and times are checked, but a changed number or pixel goes
+unnoticed if it stays plausible. ``source.checksums`` in the episode says which it was: "all bytes", "messages" or
+"none".
 
 The work is shared: ``bag`` opens the files, ``ros2_messages`` decodes single messages, ``ros2_topics`` and
 ``ros2_cameras`` collect those of one gripper or camera, ``embedded`` restores files by our own writer.
@@ -37,13 +39,13 @@ from .ros2_topics import CloudTopic, MotionTopics
 from .scene_file import SceneFile
 
 ROS2_NAME = "ros2"
-ROS2_TITLE = "ROS 2 bag (rosbag2 folder, .mcap, .db3)"
+ROS2_TITLE = "ROS bag (rosbag2 folder, .mcap, .db3, or .bag of ROS 1)"
 ROS2_UNCHECKED = {"all bytes": "", "messages": "", "none": "numbers and pixels"}
 ROS2_SOURCE_EXAMPLE = '"source": {"motion": {"left": {"pose": TOPIC, "closed": true}}, "points": {"topic": TOPIC}}'
 
 
 def matches(path: Path) -> bool:
-    """Return whether a path is a ROS 2 bag, by its content."""
+    """Return whether a path is a ROS bag, by its content."""
     return is_bag(path)
 
 
@@ -51,7 +53,7 @@ def read(path: Path, scene: SceneFile, episode: int | None) -> Imported:
     """Read a bag; images are decoded when they are written.
 
     Args:
-        path: a rosbag2 folder, or a .mcap or .db3 file.
+        path: a rosbag2 folder, or a .mcap, .db3 or .bag file.
         scene: the scene file with ``source``.
         episode: unused; a bag holds one episode.
 
@@ -91,6 +93,9 @@ def read(path: Path, scene: SceneFile, episode: int | None) -> Imported:
             **({} if origin is None else {"origin": origin}),
         },
     )
+    notes = bag.notes + [note for part in parts for note in part.notes]
+    if notes:
+        imported.notes["repairs"] = notes
     return embedded.restore_files(imported, scene)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Iterator
 from typing import Any
 
@@ -12,7 +13,7 @@ from ..checks import Fields
 from ..images import IMAGE_KINDS, ImageKind, ImageSource, ImageStream
 from . import ros2_messages
 from .bag import Bag, BagMessage
-from .imported import ImportedCamera, image_size, pair_frames, reject_unknown_keys, to_seconds
+from .imported import ImportedCamera, image_size, order_by_stamp, pair_frames, reject_unknown_keys, to_seconds
 from .ros2_topics import require_topic
 
 REP118_DEPTH_SCALE_M = 0.001  # per unit of 16UC1, by REP 118
@@ -46,7 +47,9 @@ class CameraTopics:
         reject_unknown_keys(fields)
         self.topics = [*self.images.values(), *([self.info] if self.info else [])]
         self._stamps: dict[ImageKind, list[int]] = {kind: [] for kind in self.images}
+        self._digests: dict[ImageKind, list[bytes]] = {kind: [] for kind in self.images}
         self._sizes: dict[ImageKind, tuple[int, int]] = {}
+        self.notes: list[str] = []
         self._metres = False
         self._known: dict[str, Any] | None = None
 
@@ -57,6 +60,7 @@ class CameraTopics:
         for kind, name in self.images.items():
             if name == message.topic:
                 self._stamps[kind].append(ros2_messages.read_stamp(message.body, message.place))
+                self._digests[kind].append(hashlib.blake2b(message.body.data, digest_size=16).digest())
                 if kind not in self._sizes:
                     self._sizes[kind] = _size(message)
                     self._metres |= kind == "depth" and getattr(message.body, "encoding", "") == "32FC1"
@@ -75,6 +79,11 @@ class CameraTopics:
             known["width"], known["height"] = next(iter(self._sizes.values()))
         if "depth" in self.images:
             known["depth_scale"] = FLOAT_DEPTH_SCALE_M if self._metres else self.depth_scale or REP118_DEPTH_SCALE_M
+        chosen: dict[ImageKind, np.ndarray] = {}
+        for kind, stamps in self._stamps.items():
+            chosen[kind], notes = order_by_stamp(stamps, self._digests[kind], self.images[kind])
+            self.notes += notes
+            self._stamps[kind] = [stamps[i] for i in chosen[kind]]
         numbers = self._frames()
         streams: dict[ImageKind, ImageStream] = {
             kind: ImageStream(
@@ -83,7 +92,7 @@ class CameraTopics:
                 to_seconds(stamps, start),
                 (),
                 self._sizes[kind],
-                BagImages(self.bag, self.images[kind], kind),
+                BagImages(self.bag, self.images[kind], kind, chosen[kind]),
             )
             for kind, stamps in self._stamps.items()
         }
@@ -122,17 +131,34 @@ class CameraTopics:
 
 
 class BagImages(ImageSource):
-    """The images of one topic, decoded one after the other."""
+    """The images of one topic, decoded one after the other.
 
-    def __init__(self, bag: Bag, name: str, kind: ImageKind) -> None:
+    Args:
+        bag: where they are.
+        name: the topic.
+        kind: of the images.
+        chosen: which messages of the topic to use, in this order; None: all.
+    """
+
+    def __init__(self, bag: Bag, name: str, kind: ImageKind, chosen: np.ndarray | None = None) -> None:
         self.bag, self.topic, self.kind = bag, name, kind
+        self._ranks = None if chosen is None else {int(i): rank for rank, i in enumerate(chosen)}
 
     def __iter__(self) -> Iterator[np.ndarray | bytes]:
-        for message in self.bag.messages([self.topic]):
-            if hasattr(message.body, "encoding"):
-                yield self._pixels(message)
-            else:
-                yield ros2_messages.read_compressed(message.body, message.place)
+        early: dict[int, BagMessage] = {}  # messages that were logged before their turn
+        rank = 0
+        for i, message in enumerate(self.bag.messages([self.topic])):
+            if self._ranks is not None and i not in self._ranks:
+                continue
+            early[i if self._ranks is None else self._ranks[i]] = message
+            while rank in early:
+                yield self._decode(early.pop(rank))
+                rank += 1
+
+    def _decode(self, message: BagMessage) -> np.ndarray | bytes:
+        if hasattr(message.body, "encoding"):
+            return self._pixels(message)
+        return ros2_messages.read_compressed(message.body, message.place)
 
     def _pixels(self, message: BagMessage) -> np.ndarray:
         pixels = ros2_messages.read_pixels(message.body, message.place)

@@ -1,4 +1,4 @@
-"""Decoding of single ROS 2 messages to arrays.
+"""Decoding of single ROS messages to arrays.
 
 Messages are objects with the fields of sensor_msgs and geometry_msgs.
 """
@@ -94,12 +94,12 @@ def read_intrinsics(message: Any, place: str, *, rectified: bool) -> dict[str, A
     if message.distortion_model not in DISTORTION_MODELS:
         expected = "plumb_bob or rational_polynomial"
         raise RecordingError(f"{place} has another lens model", got=repr(message.distortion_model), expected=expected)
-    K = np.asarray(message.k, dtype=float).reshape(3, 3)
-    P = np.asarray(message.p, dtype=float).reshape(3, 4)
+    k, d, p = (getattr(message, name, getattr(message, name.upper(), None)) for name in "kdp")  # ROS 1: K, D, P
+    K, P = np.asarray(k, dtype=float).reshape(3, 3), np.asarray(p, dtype=float).reshape(3, 4)
     known = {"width": int(message.width), "height": int(message.height)}
     if rectified:
         return {**known, "K": P[:, :3]}
-    return {**known, "K": K, "distortion": np.asarray(message.d, dtype=float)}
+    return {**known, "K": K, "distortion": np.asarray(d, dtype=float)}
 
 
 def read_cloud(message: Any, place: str) -> np.ndarray:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
 from ...errors import RecordingError
@@ -9,10 +11,11 @@ from .. import checks
 from ..checks import Fields
 from . import ros2_messages
 from .bag import Bag, BagMessage
-from .imported import reject_unknown_keys, to_pose_matrices, to_quaternions, to_seconds
+from .imported import order_by_stamp, reject_unknown_keys, to_pose_matrices, to_quaternions, to_seconds
 from .scene_file import SceneFile
 
 WORLD_FRAMES = ("world", "map")
+SCENE_TOPIC = "/torchcloth/scene"  # of bags by our own writer
 MAX_WRENCH_DELAY_S = 0.1  # wrenches may begin this much after the first knot, or end this much before the last
 
 
@@ -76,6 +79,7 @@ class MotionTopics:
         self.topics = [t for t in (self.pose, joints, self.closed.topic, self.wrench) if t]
         self._poses: list[tuple[int, int, np.ndarray]] = []  # times of measurement and logging [ns], pose
         self._wrenches: list[tuple[int, np.ndarray]] = []
+        self.notes: list[str] = []
 
     def take(self, message: BagMessage) -> None:
         """Store the content of a message."""
@@ -107,6 +111,9 @@ class MotionTopics:
         out: dict[str, np.ndarray] = {}
         if self.joints:
             out, logged = self.joints.arrays(start), self.joints.logged()
+            self.notes += self.joints.notes
+        self._poses = self._in_order(self._poses, self.pose)
+        self._wrenches = self._in_order(self._wrenches, self.wrench)
         if self.pose:
             poses, logged = self._pose_arrays(start), [p[1] for p in self._poses]
             if out and not np.array_equal(poses["t"], out["t"]):
@@ -121,6 +128,13 @@ class MotionTopics:
                 f"{self.place}: {self.wrench} is empty", expected="wrenches", remedy="leave it out of source"
             )
         return out | self._wrench_arrays(out, start) if self._wrenches else out
+
+    def _in_order(self, messages: list[Any], topic: str | None) -> list[Any]:
+        """Messages (stamp, ..., array) by their stamps, each once."""
+        stamps, contents = [message[0] for message in messages], [message[-1].tobytes() for message in messages]
+        chosen, notes = order_by_stamp(stamps, contents, f"{topic}")
+        self.notes += notes
+        return [messages[i] for i in chosen]
 
     def _pose_arrays(self, start: int) -> dict[str, np.ndarray]:
         if not self._poses:
@@ -152,7 +166,10 @@ class MotionTopics:
 
 
 class JointTopic:
-    """The joint states of one arm; messages without any of its joints belong to another arm."""
+    """The joint states of one arm; messages without any of its joints belong to another arm.
+
+    The finger may come in messages of its own: its opening is then interpolated to the times of the arm.
+    """
 
     def __init__(self, fields: Fields, bag: Bag) -> None:
         self.place = fields.place
@@ -160,22 +177,27 @@ class JointTopic:
         names = fields.take("names")
         if not isinstance(names, list) or not names or not all(isinstance(n, str) for n in names):
             raise RecordingError(f"{fields.location('names')} is unclear", got=names, expected="joint names, in order")
-        self.width = fields.optional(fields.text, "width")
+        self.names, self.width = names, fields.optional(fields.text, "width")
         reject_unknown_keys(fields)
-        self.names = [*names, *([self.width] if self.width else [])]
-        self._states: list[tuple[int, int, list[float]]] = []
+        self.notes: list[str] = []
+        self._states: list[tuple[int, int, np.ndarray]] = []  # times of measurement and logging [ns], angles
+        self._widths: list[tuple[int, np.ndarray]] = []
 
     def take(self, message: BagMessage) -> None:
         """Store the content of a message."""
         body = message.body
         values = dict(zip(body.name, np.asarray(body.position, dtype=float).tolist(), strict=False))
         missing = [n for n in self.names if n not in values]
-        if len(missing) == len(self.names):
+        has_width = self.width is not None and self.width in values
+        if len(missing) == len(self.names) and not has_width:
             return
-        if missing or len(values) < len(body.name):
+        if (missing and len(missing) < len(self.names)) or len(values) < len(body.name):
             raise RecordingError(f"{message.place} lacks joints", got=missing or "fewer positions than names")
-        state = [values[n] for n in self.names]
-        self._states.append((ros2_messages.read_stamp(body, message.place), message.log_time, state))
+        stamp = ros2_messages.read_stamp(body, message.place)
+        if not missing:
+            self._states.append((stamp, message.log_time, np.array([values[n] for n in self.names])))
+        if has_width:
+            self._widths.append((stamp, np.array([values[self.width or ""]])))
 
     def stamps(self) -> list[int]:
         """Return the times of measurement [ns]."""
@@ -187,11 +209,26 @@ class JointTopic:
 
     def arrays(self, start: int) -> dict[str, np.ndarray]:
         """Return t, q and width as in motion.npz."""
-        if not self._states:
-            raise RecordingError(f"{self.place}: no message of {self.topic} holds the joints", got=self.names)
-        values = np.array([state[2] for state in self._states])
-        t = to_seconds(self.stamps(), start)
-        return {"t": t, "q": values[:, :-1], "width": values[:, -1]} if self.width else {"t": t, "q": values}
+        if not self._states or (self.width and not self._widths):
+            names = self.names if not self._states else [self.width]
+            raise RecordingError(f"{self.place}: no message of {self.topic} holds the joints", got=names)
+        chosen, self.notes = order_by_stamp(
+            self.stamps(), [state[2].tobytes() for state in self._states], f"{self.topic}, {self.names[0]} ..."
+        )
+        self._states = [self._states[i] for i in chosen]
+        t, q = to_seconds(self.stamps(), start), np.array([state[2] for state in self._states])
+        return {"t": t, "q": q, "width": self._width_at(t, start)} if self.width else {"t": t, "q": q}
+
+    def _width_at(self, t: np.ndarray, start: int) -> np.ndarray:
+        """Opening [K] m at the times of the arm."""
+        stamps, contents = [w[0] for w in self._widths], [w[1].tobytes() for w in self._widths]
+        chosen, notes = order_by_stamp(stamps, contents, f"{self.topic}, {self.width}")
+        known = to_seconds([stamps[i] for i in chosen], start)
+        values = np.array([self._widths[i][1] for i in chosen])
+        if np.array_equal(known, t):
+            return values[:, 0]
+        self.notes += [*notes, f"{self.topic}: {self.width} comes in messages of its own and is interpolated"]
+        return interpolate_linearly(t, known, values, f"{self.place}: {self.width}")[:, 0]
 
 
 class ClosedTopic:
@@ -233,12 +270,16 @@ class CloudTopic:
         self.frame = frame_pose_of(fields, scene)
         reject_unknown_keys(fields)
         self.topics = [self.topic]
+        self.is_from_driver = SCENE_TOPIC not in bag.types  # else our own writer's, whose points are all readings
+        self.notes: list[str] = []
         self._clouds: list[tuple[int, np.ndarray]] = []
 
     def take(self, message: BagMessage) -> None:
         """Store a cloud; an empty one is left out."""
         check_world_frame(message, self.frame, f'set "frame" in {self.place}')
         xyz = ros2_messages.read_cloud(message.body, message.place)
+        if self.is_from_driver:
+            xyz = xyz[xyz.any(axis=1)]  # drivers write (0, 0, 0), the lens, where there is no reading
         if len(xyz):
             self._clouds.append((ros2_messages.read_stamp(message.body, message.place), xyz))
 
@@ -250,6 +291,8 @@ class CloudTopic:
         """Return the arrays of points.npz."""
         if not self._clouds:
             raise RecordingError(f"{self.place}: {self.topic} holds no point", expected="clouds of the cloth")
+        chosen, self.notes = order_by_stamp(self.stamps(), [xyz.tobytes() for _, xyz in self._clouds], self.topic)
+        self._clouds = [self._clouds[i] for i in chosen]
         xyz = np.concatenate([cloud for _, cloud in self._clouds])
         if self.frame is not None and not np.array_equal(self.frame, np.eye(4)):
             xyz = xyz @ self.frame[:3, :3].T + self.frame[:3, 3]
