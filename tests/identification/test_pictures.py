@@ -5,7 +5,8 @@ from typing import Any
 
 import torch
 
-from torchcloth.identification.pictures import _force_readings, plot_parameters, save_figure
+from torchcloth._utils.files import save_figure
+from torchcloth.identification.pictures import _force_readings, plot_parameters
 
 
 def estimate(value, initial, *ci95) -> Any:

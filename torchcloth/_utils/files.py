@@ -43,6 +43,13 @@ def write_text(path: Path, text: str) -> Path:
     return path
 
 
+def save_figure(figure: Any, path: Path) -> Path:
+    """Write a matplotlib figure as PNG so that a crash leaves the old one or the new, never half."""
+    with write_atomically(path) as part:
+        figure.savefig(part, dpi=110, bbox_inches="tight")
+    return path
+
+
 def to_json(content: Any) -> str:
     """Return the JSON text of a result; numbers that are not finite become null."""
     return json.dumps(_finite(content), indent=1, allow_nan=False) + "\n"

@@ -112,9 +112,10 @@ def report(folder: Path, fit: FieldFit, cloth: Cloth) -> int:
     from rich.console import Console
     from rich.table import Table
 
+    from .._utils.files import save_figure
     from .._utils.resume import clear_store
     from ..identification.fields import FIELDS_FILE_NAME
-    from ..identification.pictures import plot_fields, save_figure
+    from ..identification.pictures import plot_fields
 
     note = replacement_note(folder / FIELDS_FILE_NAME)
     path = fit.save(folder)

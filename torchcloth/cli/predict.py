@@ -7,7 +7,7 @@ import math
 from pathlib import Path
 from typing import Any
 
-from .._utils.files import to_json, write_text
+from .._utils.files import save_figure, to_json, write_text
 from ..errors import InvalidInput
 from .output_paths import check_output_folder, check_outside_episodes, output_path, replacement_note
 
@@ -99,7 +99,7 @@ def _predict(options: argparse.Namespace) -> int:
 
 
 def _predict_strip(fit: Path, out: Path, options: argparse.Namespace) -> int:
-    from ..identification import make_specimen, pictures, predict_tension, prediction_report, read_tension_model
+    from ..identification import make_specimen, predict_tension, prediction_report, read_tension_model
     from ..recordings import read_tension
 
     model, strip_values = read_tension_model(fit), (options.length, options.width, options.preload, options.strain)
@@ -114,7 +114,7 @@ def _predict_strip(fit: Path, out: Path, options: argparse.Namespace) -> int:
         prediction = predict_tension(model, *make_specimen(model, math.radians(options.angle), **size))
     note = replacement_note(out / PREDICTION_FILE_NAME)
     path = _write(out, prediction.as_dict())
-    picture = pictures.save_figure(prediction_report.plot_tension_prediction(prediction), out / "prediction.png")
+    picture = save_figure(prediction_report.plot_tension_prediction(prediction), out / "prediction.png")
     prediction_report.print_tension_prediction(prediction)
     print(f"result:   {path}{note}\npicture:  {picture}")
     return 0
@@ -125,7 +125,7 @@ def _predict_episode(fit: Path, out: Path, options: argparse.Namespace) -> int:
 
     from .. import diagnosis, recordings
     from .._utils.files import write_atomically
-    from ..identification import is_fitted_episode, pictures, predict_episode, prediction_report
+    from ..identification import is_fitted_episode, predict_episode, prediction_report
 
     if options.data is None:
         raise InvalidInput("DATA", got="none", expected="an episode whose motion is to be predicted")
@@ -143,7 +143,7 @@ def _predict_episode(fit: Path, out: Path, options: argparse.Namespace) -> int:
         )
         interval, faces = prediction.half_width.numpy(), prediction.cloth.mesh.faces
         np.savez_compressed(file, t=t, vertices=vertices, std=std, interval=interval, faces=faces)
-    picture = pictures.save_figure(prediction_report.plot_episode_prediction(prediction), out / "prediction.png")
+    picture = save_figure(prediction_report.plot_episode_prediction(prediction), out / "prediction.png")
     prediction_report.print_episode_prediction(prediction)
     if diagnosis.was_fitted(fit, recording) if is_model else is_fitted_episode(fit, recording):
         print("note: the fit used this episode, so its distances are residuals and not prediction errors")

@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from .._utils.files import write_atomically
+from .._utils.files import save_figure
 from ..cloth import Cloth
 from ..episodes.observed import Episode
 from ..losses import find_closest_points
@@ -51,13 +51,6 @@ def save_fit_pictures(fit: Identification, episodes: Sequence[Episode], faces: n
     for name in {"fit", "distances", "forces"} - figures.keys():
         (folder / f"{name}.png").unlink(missing_ok=True)
     return [save_figure(figure, folder / f"{name}.png") for name, figure in figures.items()]
-
-
-def save_figure(figure: Any, path: Path) -> Path:
-    """Write a matplotlib figure as PNG so that a crash leaves the old one or the new, never half."""
-    with write_atomically(path) as part:
-        figure.savefig(part, dpi=110, bbox_inches="tight")
-    return path
 
 
 def _distance(cloud: Tensor, vertices: Tensor, faces: Tensor) -> np.ndarray:

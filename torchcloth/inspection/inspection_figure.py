@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from ..identification.pictures import save_figure
+from .._utils.files import save_figure
 from ..observe import decode_depth
 from ..recordings.timing import GAP_FACTOR, stream_times
 from .inspect_recording import Inspection

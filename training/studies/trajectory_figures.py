@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from torchcloth.identification.pictures import save_figure
+from torchcloth._utils.files import save_figure
 
 METHOD_COLOURS = {"gauss-newton": "#1f6f8b", "adam": "#b0653a", "sac": "#888888"}
 METHOD_LABELS = {"gauss-newton": "Gauss-Newton", "adam": "Adam", "sac": "Soft Actor-Critic"}

@@ -8,7 +8,8 @@ from typing import Any
 import numpy as np
 
 from torchcloth._utils.constants import Z_95
-from torchcloth.identification.pictures import AFTER_COLOUR, BEFORE_COLOUR, NULL_COLOUR, save_figure
+from torchcloth._utils.files import save_figure
+from torchcloth.identification.pictures import AFTER_COLOUR, BEFORE_COLOUR, NULL_COLOUR
 from torchcloth.identification.prediction_report import draw_band
 from torchcloth.identification.tension.prediction import PredictionBand
 
