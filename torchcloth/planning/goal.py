@@ -10,7 +10,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ..errors import InvalidInput
+from .._utils.unpacking import load_arrays
+from ..errors import InvalidInput, TorchclothError
 from ..losses.shapes import check_triangles
 from ..meshes import load
 from ..recordings import Recording, read
@@ -123,7 +124,7 @@ def read_goal(path: str | Path, correspondences: bool = False) -> Goal:
         vertices = _vertex_indices(mesh.vertices, correspondences)
         return Goal(torch.as_tensor(mesh.vertices), torch.as_tensor(mesh.faces), vertices=vertices)
     try:
-        content = np.load(path, allow_pickle=False)
+        content = load_arrays(path.read_bytes(), str(path))
         if kind == ".npy":
             return Goal(torch.as_tensor(np.asarray(content, dtype=float)))
         x = np.asarray(content["x"], dtype=float)
@@ -131,7 +132,7 @@ def read_goal(path: str | Path, correspondences: bool = False) -> Goal:
         if "uv" in content:
             return Goal(torch.as_tensor(x), uv=torch.as_tensor(np.asarray(content["uv"], dtype=float)))
         return Goal(torch.as_tensor(x), torch.as_tensor(content["faces"]), vertices=_vertex_indices(x, correspondences))
-    except InvalidInput:
+    except TorchclothError:
         raise
     except Exception as error:  # a damaged archive can raise almost anything
         raise InvalidInput("goal", got=f"{path} ({type(error).__name__})", expected=ACCEPTED_GOALS) from None

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import json
 import os
 import zipfile
@@ -12,7 +11,8 @@ from typing import Any, BinaryIO, NoReturn
 
 import numpy as np
 
-from ..errors import RecordingError
+from .._utils.unpacking import load_arrays
+from ..errors import RecordingError, TorchclothError
 from . import checks
 
 LFS_POINTER_PREFIX = b"version https://git-lfs.github.com/spec/"  # of the text that stands for a file not fetched
@@ -142,8 +142,9 @@ class Folder:
     def _load(self, name: str) -> dict[str, np.ndarray] | np.ndarray:
         data = self.read_bytes(name)
         try:
-            loaded = np.load(io.BytesIO(data), allow_pickle=False)
-            arrays = {key: loaded[key] for key in loaded.files} if isinstance(loaded, np.lib.npyio.NpzFile) else loaded
+            arrays = load_arrays(data, self.location(name))
+        except TorchclothError:
+            raise
         except Exception as error:  # a damaged archive can raise almost anything: zlib, struct, numpy, memory
             raise RecordingError(
                 f"{self.location(name)} is truncated, corrupt or holds pickled objects",

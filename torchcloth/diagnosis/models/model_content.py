@@ -13,6 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from ..._utils.unpacking import check_archive
 from ...episodes.observed import build_effects, build_material, build_mesh
 from ...episodes.world import BaseParameter
 from ...errors import RecordingError, TorchclothError
@@ -130,7 +131,11 @@ def read_content(path: Path) -> ModelContent:
 def _open(path: Path) -> Folder:
     try:
         with zipfile.ZipFile(path) as file:
-            return Folder(path, in_memory={name: file.read(name) for name in (CONTENT_FILE, ARRAYS_FILE)})
+            members = (CONTENT_FILE, ARRAYS_FILE)
+            check_archive(file, path.stat().st_size, str(path), members)
+            return Folder(path, in_memory={name: file.read(name) for name in members})
+    except TorchclothError:
+        raise
     except Exception as error:  # a damaged archive can raise almost anything: zlib, struct, memory
         raise RecordingError(f"{path}: unreadable", got=str(error) or repr(error), expected=EXPECTED_FILE) from None
 

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import BinaryIO, Literal
 from zlib import crc32
 
+from ..._utils.unpacking import check_unpacked_size
 from ...errors import RecordingError
 
 MCAP_SIGNATURE = b"\x89MCAP0\r\n"
@@ -71,11 +72,12 @@ def _sections(file: BinaryIO, path: Path) -> tuple[int, int, int, int, bool]:
             if summary != at + 13 or struct.unpack("<Q", head[1:]) != (4,):
                 raise RecordingError(f"{path} is damaged", got="a summary that is not where the footer says")
             return at, crc, summary, footer + 9 + 16, chunked
-        if head[0] == CHUNK_OPCODE:  # its checksum follows two times and a length
-            file.seek(24, 1)
-            chunked &= file.read(4) != bytes(4)
-        chunked &= head[0] != MESSAGE_OPCODE
         (length,) = struct.unpack("<Q", head[1:])
+        if head[0] == CHUNK_OPCODE:
+            _, _, unpacked, chunk_crc = struct.unpack("<QQQI", file.read(28))
+            check_unpacked_size(unpacked, length, f"{path}: a chunk")
+            chunked &= chunk_crc != 0
+        chunked &= head[0] != MESSAGE_OPCODE
         at += 9 + length
     raise RecordingError(f"{path} is damaged", got="no end of its data", remedy="`mcap recover` may mend it")
 
