@@ -2,9 +2,34 @@
 
 from __future__ import annotations
 
+import re
+
+MAX_PART_CHARACTERS = 1000  # of each part of a message; the middle of a longer one is left out
+# C0, DEL and C1, which steer a terminal, and the marks that reverse the direction of text.
+_CONTROL_CHARACTERS = re.compile("[\x00-\x1f\x7f-\x9f\u202a-\u202e\u2066-\u2069]")
+
+
+def has_control_characters(text: str) -> bool:
+    """Return whether a text could steer a terminal or hide what it says."""
+    return _CONTROL_CHARACTERS.search(text) is not None
+
+
+def escape_control_characters(text: str) -> str:
+    """Return the text with ``\\x1b`` and the like in place of characters that could steer a terminal."""
+    return _CONTROL_CHARACTERS.sub(lambda match: match[0].encode("unicode_escape").decode(), text)
+
+
+def to_message_part(text: str) -> str:
+    """Return a text as one line of at most 1000 characters, without characters that could steer a terminal."""
+    line = escape_control_characters(" ".join(text.split()))
+    if len(line) <= MAX_PART_CHARACTERS:
+        return line
+    end = MAX_PART_CHARACTERS // 3
+    return f"{line[: MAX_PART_CHARACTERS - end]} ... {line[-end:]}"
+
 
 class TorchclothError(ValueError):
-    """Base of every error that torchcloth raises on purpose; its text is one line.
+    """Base of every error that torchcloth raises on purpose; its text is one line of bounded length.
 
     Args:
         what: name of the wrong argument, as the caller knows it.
@@ -22,7 +47,7 @@ class TorchclothError(ValueError):
             parts.append(f"expected {expected}")
         if remedy:
             parts.append(remedy)
-        super().__init__("; ".join(" ".join(part.split()) for part in parts))
+        super().__init__("; ".join(map(to_message_part, parts)))
 
     def __reduce__(self) -> tuple:
         return _rebuild, (type(self), self.what, self.got, self.expected, self.remedy)

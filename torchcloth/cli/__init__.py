@@ -14,7 +14,7 @@ from collections.abc import Sequence
 from importlib import metadata
 from typing import Any, NoReturn
 
-from ..errors import InvalidInput, TorchclothError
+from ..errors import InvalidInput, TorchclothError, to_message_part
 from . import bench, confirm, convert, diagnose, doctor, identify, inspect, plan, pose, predict, simulate, view
 
 VERBS = (
@@ -86,7 +86,7 @@ def _run(options: argparse.Namespace) -> int:
 
 def _warn(message: Warning | str, category: type[Warning], *where: Any, **help_text: Any) -> None:
     """Print a warning in one line, without its place in the library's sources."""
-    print(f"torchcloth: warning: {message}", file=sys.stderr)
+    print(f"torchcloth: warning: {to_message_part(str(message))}", file=sys.stderr)
 
 
 def _from_os_error(error: OSError) -> TorchclothError:
@@ -113,7 +113,7 @@ class _Parser(argparse.ArgumentParser):
     """Parser that reports an error in one line, without the usage of all options."""
 
     def error(self, message: str) -> NoReturn:
-        self.exit(2, f"{self.prog}: {message}; to do: see {self.prog} --help\n")
+        self.exit(2, f"{self.prog}: {to_message_part(message)}; to do: see {self.prog} --help\n")
 
 
 def build_parser() -> argparse.ArgumentParser:

@@ -8,7 +8,7 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ..errors import InvalidInput
+from ..errors import InvalidInput, to_message_part
 from .output_paths import check_output_folder, output_path
 
 if TYPE_CHECKING:
@@ -128,7 +128,7 @@ def _report(recording: Recording, target: Path) -> None:
             print(f"{name}/depth: {_describe_depth(camera.depth.load(0), camera.depth_scale)}")
     source = recording.extra.get("source")
     for note in source.get("repairs", ()) if isinstance(source, dict) else ():
-        print(f"note: {note}")
+        print(f"note: {to_message_part(str(note))}")
     if isinstance(source, dict) and source.get("unchecked"):
-        print(f"no checksum covers {source['unchecked']}: damage there is not detected")
+        print(f"no checksum covers {to_message_part(str(source['unchecked']))}: damage there is not detected")
     print(f"written: {target}")

@@ -11,7 +11,7 @@ from typing import Any, Concatenate, Literal, ParamSpec, TypeVar
 
 import numpy as np
 
-from ..errors import RecordingError
+from ..errors import RecordingError, has_control_characters
 
 MAX_SCENE_EXTENT_M = 20.0  # no cloth experiment spans more; the same number in millimetres is a handkerchief
 MAX_BASE_DISTANCE_M = 100.0  # of a base or camera from a map's origin
@@ -158,15 +158,30 @@ def check_transform(matrix: np.ndarray, place: str) -> np.ndarray:
 
 
 def check_name(value: str, place: str) -> str:
-    """Return a name that is safe as a file name and as an NPZ prefix.
+    """Return a name that is safe as a file name, as an NPZ prefix and on a terminal.
 
     Raises:
-        RecordingError: it has slashes or begins with a dot.
+        RecordingError: it has slashes or control characters, or begins with a dot.
     """
+    check_printable(value, place)
     if not _PLAIN_NAME_PATTERN.fullmatch(value):
         expected = "one name without slashes that does not begin with a dot"
         raise RecordingError(f"{place} is not a plain name", got=repr(value), expected=expected, remedy="rename it")
     return value
+
+
+def check_printable(text: str, place: str) -> str:
+    """Return a text that can be printed as it is.
+
+    Raises:
+        RecordingError: it has control characters, such as escape sequences of a terminal.
+    """
+    if has_control_characters(text):
+        expected = "no control characters"
+        raise RecordingError(
+            f"{place} is not a plain name or text", got=repr(text), expected=expected, remedy="rename it"
+        )
+    return text
 
 
 class Fields:
@@ -268,7 +283,7 @@ class Fields:
             raise RecordingError(
                 f"{self.location(key)} is not text", got=reprlib.repr(value), expected="a non-empty string"
             )
-        return value
+        return check_printable(value, self.location(key))
 
     def array(
         self, key: str, *shape: int | str, kind: Literal["float", "int", "bool"] = "float", nan: bool = False

@@ -10,7 +10,7 @@ import numpy as np
 
 from .._utils.constants import STANDARD_GRAVITY_M_PER_S2
 from ..errors import RecordingError
-from . import images, scene, streams
+from . import checks, images, scene, streams
 from .checks import Fields
 from .files import Folder
 from .timing import MAX_FRAME_INTERVAL_S
@@ -43,6 +43,7 @@ def read(path: str | Path, *, with_truth: bool = False) -> Recording:
 def read_folder(folder: Folder, *, with_truth: bool) -> Recording:
     """Read an opened folder, see ``read``."""
     _check_is_episode(folder)
+    checks.check_printable(folder.display_path.name, "name of the episode's folder")
     root = folder.read_json(EPISODE_FILE)
     _check_version(root)
     groups = streams.read_motion_groups(folder) if folder.has(streams.MOTION_FILE) else {}
