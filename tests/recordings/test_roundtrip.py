@@ -359,3 +359,12 @@ def test_a_users_file_may_have_any_name(episode):
     content["robots"]["spare"]["model"] = "rizon4_on_rail.urdf"
     path.write_text(json.dumps(content))
     assert rec.read(episode).joints["spare"].q.shape == (3, 6)
+
+
+def test_files_with_a_byte_order_mark_are_read(episode, assert_same):
+    """As editors and spreadsheets on Windows write UTF-8."""
+    before = rec.read(episode)
+    for name in ("episode.json", "cloth.obj", "cam0/timestamps.csv"):
+        path = episode / name
+        path.write_text(path.read_text(encoding="utf-8"), encoding="utf-8-sig")
+    assert_same(rec.read(episode), before)

@@ -132,3 +132,12 @@ def test_damaged_bytes_are_refused_or_harmless(folder):
         assert np.abs(back.strain).max() <= 5
         accepted += 1
     assert 0 < accepted < 100
+
+
+def test_a_table_with_a_byte_order_mark_is_read(tmp_path):
+    specimen = {"length": 0.1, "width": 0.05, "angle": 0.0}
+    table = rec.ForceDisplacement(**specimen, displacement=np.arange(3) * 1e-3, force=np.arange(3.0))
+    folder = rec.write_tension(table, tmp_path / "table")
+    for path in folder.iterdir():
+        path.write_text(path.read_text(encoding="utf-8"), encoding="utf-8-sig")
+    np.testing.assert_array_equal(rec.read_tension(folder).force, table.force)

@@ -7,6 +7,7 @@ import math
 import os
 import zipfile
 from collections.abc import Sequence
+from typing import IO
 
 import numpy as np
 
@@ -75,7 +76,7 @@ def load_arrays(data: bytes, place: str) -> dict[str, np.ndarray] | np.ndarray:
     return {key: loaded[key] for key in loaded.files} if isinstance(loaded, np.lib.npyio.NpzFile) else loaded
 
 
-def _check_header(file: io.BufferedIOBase | zipfile.ZipExtFile, size: int, place: str) -> None:
+def _check_header(file: IO[bytes], size: int, place: str) -> None:
     """Refuse an array whose header declares more bytes than there are: numpy would reserve them."""
     version = np.lib.format.read_magic(file)
     read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0

@@ -101,9 +101,9 @@ class Folder:
             raise RecordingError(f"{place} cannot be read", got=error.strerror, expected="a readable file") from error
 
     def read_text(self, name: str) -> str:
-        """Return the text of a UTF-8 file."""
+        """Return the text of a UTF-8 file, without a byte order mark."""
         try:
-            return self.read_bytes(name).decode()
+            return self.read_bytes(name).decode("utf-8-sig")
         except UnicodeDecodeError as error:
             raise RecordingError(
                 f"{self.location(name)} is not UTF-8 text", got=error.reason, remedy="restore it"

@@ -205,7 +205,7 @@ def _read_text(path: str) -> str:
     if not file.is_file() and (shipped / f"{path}.yaml").is_file():
         return (shipped / f"{path}.yaml").read_text()
     try:
-        return file.read_text()
+        return file.read_text(encoding="utf-8-sig")
     except (OSError, UnicodeDecodeError) as error:
         names = sorted(entry.name.removesuffix(".yaml") for entry in shipped.iterdir())
         expected = f"a YAML file, or a shipped one: {', '.join(names)}"

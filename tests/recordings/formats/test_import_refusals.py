@@ -452,3 +452,14 @@ def test_a_matroska_file_of_another_camera(tmp_path):
         container.mux(stream.encode())
     with pytest.raises(RecordingError, match="a track has an unknown title; got None; expected DEPTH, COLOR, IR, IMU"):
         formats.read(path)
+
+
+@pytest.mark.parametrize(("name", "files"), [("tum", ["rgb.txt", "groundtruth.txt"]), ("redwood", ["trajectory.log"])])
+def test_files_with_a_byte_order_mark_are_read(copy, name, files):
+    truth = copy(name)
+    for path in [truth.path / file for file in files]:
+        lines = [line for line in path.read_text().splitlines() if not line.startswith("#")]
+        path.write_text("\n".join(lines), encoding="utf-8-sig")
+    scene = truth.write_scene()
+    scene.write_text(scene.read_text(), encoding="utf-8-sig")
+    assert formats.read(truth.path, scene=scene).cameras["cam0"].depth is not None

@@ -35,7 +35,7 @@ def read_result(
     path = Path(path)
     path = path / name if path.is_dir() else path
     try:
-        content = json.loads(path.read_text())
+        content = json.loads(path.read_text(encoding="utf-8-sig"))
     except FileNotFoundError:
         models = ", ".join(sorted(map(str, path.parent.glob("*.tcm"))))
         alternative = f"or a model: {models}" if models else ""

@@ -102,9 +102,9 @@ def read_bytes(path: Path) -> bytes:
 
 
 def read_text(path: Path) -> str:
-    """Return the text of a UTF-8 file."""
+    """Return the text of a UTF-8 file, without a byte order mark."""
     try:
-        return read_bytes(path).decode()
+        return read_bytes(path).decode("utf-8-sig")
     except UnicodeDecodeError as error:
         raise RecordingError(f"{path} is not UTF-8 text", got=error.reason, remedy="restore it") from error
 
