@@ -6,7 +6,7 @@ import warnings
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
 from itertools import pairwise
-from typing import cast
+from typing import Self, cast
 
 import numpy as np
 import torch
@@ -34,7 +34,7 @@ from .engine.dispatch import (
 from .errors import TorchclothError
 from .materials import AbstractMaterial
 from .meshes import Mesh
-from .parameters import PhysicalParameter
+from .parameters import PhysicalParameter, require_default_gradients
 from .simulation.argument_checks import (
     as_positions,
     check_axes,
@@ -75,8 +75,8 @@ class Cloth(nn.Module):
         areal_density: rho_A [kg/m^2]; scalar or one value per triangle; learnable.
         effects: by name, e.g. ``{"gravity": Gravity(), "air": AirDrag()}``. None: no effects, not even weight.
         boundaries: grasps and colliders by name, applied in order.
-        contact: discretisation of contact between layers. None: no contact, and the parameters k, gamma and c_F of the
-            material have no effect.
+        contact: discretisation of contact between layers. None: no contact. The parameters k, gamma and c_F of the
+            material then have no effect and require no gradients.
         engine: what computes the substeps. "auto": the fused engine (C++, CUDA C++; float32 or float64) if it knows
             all parts, else the torch reference, on CUDA in graphs; ``print(cloth)`` says which and why. "fused": raise
             an error if the engine cannot. "reference": always torch, on CUDA launched one by one. The attribute of the
@@ -126,6 +126,7 @@ class Cloth(nn.Module):
         contact_warnings = () if self._grid is None else self._grid.contact_warnings(mesh)
         for text in (*mesh_warnings(mesh, self.areal_density.value), *contact_warnings):
             warnings.warn(text, stacklevel=2)
+        self._freeze_inert_parameters()
         self._store_geometry()
         for tensor in (*self.parameters(), *self.buffers()):  # parts take the precision of the cloth
             if tensor.is_floating_point():
@@ -289,6 +290,15 @@ class Cloth(nn.Module):
             if isinstance(part, PhysicalParameter):
                 part.clip_()
 
+    def require_default_gradients_(self) -> Self:
+        """Let every parameter require gradients but facts about the world (gravity, wind, sizes) and what cannot act.
+
+        So it is in a new cloth. A fact is learned after ``requires_grad_()`` on its parameter.
+        """
+        require_default_gradients(self)
+        self._freeze_inert_parameters()
+        return self
+
     @disable_autocast()
     def stable_step(self) -> float:
         """Compute the default substep [s] from the stiffest element and the present parameters."""
@@ -351,6 +361,12 @@ class Cloth(nn.Module):
         return None if self._grid is None else self._grid._replace(points=self._points, non_adjacent=self._non_adjacent)
 
     # -- parts of the above ---------------------------------------------------------------------------------------
+
+    def _freeze_inert_parameters(self) -> None:
+        """Let parameters of contact require no gradients without it, as DistributedDataParallel waits for gradients."""
+        if self._contact is None:
+            for name in self.material.contact_parameters:
+                getattr(self.material, name).requires_grad_(False)
 
     def _named_effects(self) -> Iterable[tuple[str, AbstractEffect]]:
         return cast("Iterable[tuple[str, AbstractEffect]]", self.effects.items())

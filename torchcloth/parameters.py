@@ -163,6 +163,17 @@ class PhysicalParameter(nn.Module):
         return f"{shown} {self.unit}"
 
 
+def require_default_gradients(part: nn.Module) -> None:
+    """Set which parameters of a part require gradients: all but facts about the world, ``world_facts`` by name.
+
+    An optimiser over all parameters would else explain misfit by another gravity.
+    """
+    part.requires_grad_(True)
+    for module in part.modules():
+        for name in getattr(module, "world_facts", ()):
+            getattr(module, name).requires_grad_(False)
+
+
 def call_with_parameters(module: nn.Module, values: Mapping[str, Tensor], arguments: tuple) -> Any:
     """Return ``module(*arguments)`` with ``values`` in place of the parameters of these names.
 

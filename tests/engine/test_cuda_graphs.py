@@ -63,6 +63,7 @@ def scene(contact: bool = True, opens: bool = False, effects: dict[str, tc.effec
 def outcome(made, capture: cuda_graphs.Capture | None = None):
     """(the rollout, gradients of a function of it, the graphs)."""
     cloth, state, motion = made
+    cloth.requires_grad_(True)  # also of gravity and wind
     x = state.x.clone().requires_grad_()
     plan = cloth.schedule(state._replace(x=x), motion, FRAMES, None)
     graphs = None if capture is None else GraphedRollout(plan.model, sum(plan.counts), capture)

@@ -78,7 +78,7 @@ def simulated(cloth, times=TIMES):
     state, motion = make_perturbed_state(cloth, (2,)), make_opening_motion(times[-1])
     poses = {name: t._replace(pose=t.pose.to(state.x).requires_grad_()) for name, t in motion.items()}
     x = state.x.clone().requires_grad_()
-    cloth.zero_grad()
+    cloth.requires_grad_(True).zero_grad()
     out = cloth(state._replace(x=x), poses, times)
     (out.x.square().sum() + out.state.d3.square().sum() + 1e-3 * out.wrench["left"].square().sum()).backward()
     named = {"x": x, "pose": poses["right"].pose, **dict(cloth.named_parameters())}

@@ -170,6 +170,7 @@ def test_joint_angles_material_and_effects_in_one_graph():
     check_gradients(loss, inputs, MARK, STEP_SIZES, sizes=step_scales(inputs))
 
     q = torch.nn.Parameter(waypoints)
+    cloth.effects["gravity"].acceleration.requires_grad_()
     out = cloth(state, {"hand": arm.motion(q, torch.linspace(0.0, end, 3), period=0.004)}, [0.0, end], dt=dt)
     ((out.x[-1] - target) ** 2).sum().backward()
     assert bool((q.grad[1:] != 0).all())

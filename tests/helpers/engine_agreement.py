@@ -45,6 +45,7 @@ def check_agreement(
     stages: int = 0,
 ) -> dict[str, float]:
     """Check that both engines agree, and return the largest relative differences by name."""
+    cloth.requires_grad_(True)  # also of facts about the world
     reference = compute_outcome(roll_out_in_segments, cloth, motion, state, substeps, dt, stages)
     engine = compute_outcome(fused.rollout, cloth, motion, state, substeps, dt, stages)
     results = {name: relative_difference(engine.values[name], value) for name, value in reference.values.items()}
@@ -120,7 +121,7 @@ def sensitivity_adjoint_error(
     cloth: tc.Cloth, motion: Mapping[str, Trajectory], state: ClothState, substeps: int, dt: float
 ) -> float:
     """Return the largest relative difference between ``Cloth.sensitivities`` and gradients, along random changes."""
-    cloth.zero_grad()
+    cloth.requires_grad_(True).zero_grad()
     generator, limit = torch.Generator().manual_seed(2), dt * (1 + 1e-9)
     named, times = dict(cloth.named_parameters()), (0.0, substeps * dt)
     along = {name: torch.randn(3, *p.shape, generator=generator, dtype=p.dtype) for name, p in named.items()}

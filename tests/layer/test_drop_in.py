@@ -58,6 +58,59 @@ def test_a_step_below_zero_is_refused_by_name_and_can_be_taken_back():
     assert loss_of(cloth, motion).isfinite()
 
 
+def facts(cloth):
+    air, gravity, ball = cloth.effects["air"], cloth.effects["gravity"], cloth.boundaries["ball"]
+    return [gravity.acceleration, gravity.tilt, air.wind, ball.radius.raw, cloth.boundaries["box"].size.raw]
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+def test_an_optimiser_of_all_parameters_leaves_the_world_alone(engine):
+    """Reported: thirty steps learned a gravity of (-0.09, 0.26, -10.10) m/s^2, its tilt and a wind."""
+    effects = {"gravity": tc.effects.Gravity(), "air": tc.effects.AirDrag()}
+    cloth, motion = gripped(effects, engine)
+    cloth.boundaries["ball"] = tc.boundaries.Sphere(0.05, (0.1, 0.1, -0.06))
+    cloth.boundaries["box"] = tc.boundaries.Box((0.1, 0.1, 0.1))
+    before = [fact.detach().clone() for fact in facts(cloth)]
+    optimiser = torch.optim.Adam(cloth.parameters(), lr=1e-2)
+    loss_of(cloth, motion).backward()
+    optimiser.step()
+    assert all(torch.equal(fact, value) for fact, value in zip(facts(cloth), before, strict=True))
+    assert float(cloth.effects["air"].normal.value.detach()) != 1.2
+    cloth.clip_()
+    for fact in facts(cloth):
+        fact.requires_grad_()
+    loss_of(cloth, motion).backward()
+    assert all(fact.grad is not None for fact in facts(cloth))
+    cloth.require_default_gradients_()
+    assert not any(fact.requires_grad for fact in facts(cloth))
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+def test_data_parallel_training_waits_for_no_parameter_that_cannot_act(engine, tmp_path):
+    """Reported: without contact, the second step complained of parameters that were not used."""
+    effects = {"gravity": tc.effects.Gravity(), "air": tc.effects.AirDrag()}
+    cloth, motion = gripped(effects, engine)
+    torch.distributed.init_process_group("gloo", init_method=f"file://{tmp_path}/store", rank=0, world_size=1)
+    try:
+        parallel = nn.parallel.DistributedDataParallel(cloth)
+        for _ in range(3):
+            parallel(cloth.rest_state(), motion, times=(0.0, 0.04)).x[-1].square().sum().backward()
+    finally:
+        torch.distributed.destroy_process_group()
+    assert all(p.grad is not None for p in cloth.parameters() if p.requires_grad)
+    assert not cloth.material.contact_stiffness.raw.requires_grad
+
+
+def test_contact_lets_its_parameters_be_learned():
+    for contact, learned in ((None, False), (tc.Contact(), True)):
+        cloth = make_sheet(contact=contact)
+        for again in (cloth, copy.deepcopy(cloth), cloth.requires_grad_(True).require_default_gradients_()):
+            material = again.material
+            for parameter in (material.contact_stiffness, material.shear_stiffness, material.cone):
+                assert parameter.raw.requires_grad is learned
+            assert material.youngs_modulus.raw.requires_grad
+
+
 def test_a_state_is_the_callers():
     cloth, _ = gripped()
     cloth.rest_state().x.add_(0.5)

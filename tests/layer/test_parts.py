@@ -128,6 +128,7 @@ def test_gradients_are_those_of_the_values_that_were_simulated(engine):
         7, effects={"damping": tc.effects.MassDamping(0.5), "pull": Pull()}, boundaries={"ball": ball}, Y=1.0
     )
     cloth.engine = engine
+    ball.radius.requires_grad_()
     raw = [n.raw for n in (cloth.effects["pull"].strength, cloth.effects["damping"].rate, ball.friction, ball.radius)]
     state = cloth.state(cloth.rest_state().x, torch.tensor([0.3, 0.1, -0.1]).expand(49, 3))
 

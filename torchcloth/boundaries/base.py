@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from typing import NamedTuple
+from collections.abc import Collection
+from typing import ClassVar, NamedTuple
 
 from torch import Tensor, nn
 
@@ -30,9 +31,12 @@ class AbstractBoundary(nn.Module, ABC):
     Attributes:
         is_prescribed: the boundary follows a body, and needs a trajectory in ``motion``. The layer then reports the
             wrench that the cloth exerts on the body.
+        world_facts: names of the parameters that are facts about the world, such as sizes. They require no gradients
+            until the user asks for them by ``requires_grad_``.
     """
 
     is_prescribed: bool = False
+    world_facts: ClassVar[Collection[str]] = ()
 
     @abstractmethod
     def bind(self, mesh: Mesh) -> AbstractBoundary:

@@ -20,7 +20,7 @@ class Sphere(AbstractCollider):
     """A ball with a learnable radius.
 
     Args:
-        radius: [m], learnable.
+        radius: [m], learnable after ``radius.requires_grad_()``.
         centre: [3] m.
         friction: Coulomb coefficient >= 0, or a law.
         options: as for every collider (``AbstractCollider``).
@@ -28,6 +28,8 @@ class Sphere(AbstractCollider):
     Raises:
         InvalidInput: a radius that is not positive.
     """
+
+    world_facts = ("radius",)
 
     def __init__(
         self,
@@ -37,7 +39,7 @@ class Sphere(AbstractCollider):
         **options: Unpack[ColliderOptions],
     ) -> None:
         super().__init__(friction, **options)
-        self.radius = PhysicalParameter(radius, "m", name="radius")
+        self.radius = PhysicalParameter(radius, "m", name="radius").requires_grad_(False)
         check_scalar("radius", self.radius)
         self.register_buffer("centre", parse_vector("centre", centre), persistent=False)
         self.register_buffer("up", parse_vector("up", (0.0, 0.0, 1.0)), persistent=False)
@@ -54,7 +56,7 @@ class Box(AbstractCollider):
     """A rectangular block with learnable edge lengths.
 
     Args:
-        size: [3] m, edge lengths along its own axes, learnable.
+        size: [3] m, edge lengths along its own axes, learnable after ``size.requires_grad_()``.
         pose: [4, 4], of the block's centre and axes in the world, or in the body when it moves. None: the origin.
         friction: Coulomb coefficient >= 0, or a law.
         options: as for every collider (``AbstractCollider``).
@@ -62,6 +64,8 @@ class Box(AbstractCollider):
     Raises:
         InvalidInput: sizes that are not three positive lengths, or a pose that is not rigid.
     """
+
+    world_facts = ("size",)
 
     def __init__(
         self,
@@ -71,7 +75,7 @@ class Box(AbstractCollider):
         **options: Unpack[ColliderOptions],
     ) -> None:
         super().__init__(friction, pose=pose, **options)
-        self.size = PhysicalParameter(parse_vector("box size", size), "m", name="box size")
+        self.size = PhysicalParameter(parse_vector("box size", size), "m", name="box size").requires_grad_(False)
 
     def distance(self, p: Tensor) -> tuple[Tensor, Tensor]:
         """Compute the distance to the nearest face, edge or corner."""
@@ -82,6 +86,8 @@ class Box(AbstractCollider):
 
 class _Axial(AbstractCollider):
     """A solid with an axis and a radius."""
+
+    world_facts = ("radius",)
 
     def __init__(
         self,
@@ -95,7 +101,7 @@ class _Axial(AbstractCollider):
         a, b = parse_vector("start", start), parse_vector("end", end)
         if not float((b - a).norm()) > 0:
             raise InvalidInput("axis", got=f"from {start} to {end}", expected="two different points")
-        self.radius = PhysicalParameter(radius, "m", name="radius")
+        self.radius = PhysicalParameter(radius, "m", name="radius").requires_grad_(False)
         check_scalar("radius", self.radius)
         self.register_buffer("start", a, persistent=False)
         self.register_buffer("end", b, persistent=False)
@@ -112,7 +118,7 @@ class Capsule(_Axial):
     Args:
         start: [3] m, one end of the segment.
         end: [3] m, the other.
-        radius: [m], learnable.
+        radius: [m], learnable after ``radius.requires_grad_()``.
         friction: Coulomb coefficient >= 0, or a law.
         options: as for every collider (``AbstractCollider``).
 
@@ -134,7 +140,7 @@ class Cylinder(_Axial):
     Args:
         start: [3] m, centre of one end.
         end: [3] m, centre of the other.
-        radius: [m], learnable.
+        radius: [m], learnable after ``radius.requires_grad_()``.
         friction: Coulomb coefficient >= 0, or a law.
         options: as for every collider (``AbstractCollider``).
 

@@ -210,7 +210,7 @@ def _cloth_from_model(options: argparse.Namespace, recording: Recording) -> tupl
     if options.contact is not None:
         raise InvalidInput("--contact", got="it and --model", expected="one of them")
     file = diagnosis.read_model(options.model, recording)
-    return file.model.build_world().cloth.requires_grad_(True), describe_causes_outside_cloth(file.model)
+    return file.model.build_world().cloth.require_default_gradients_(), describe_causes_outside_cloth(file.model)
 
 
 def describe_causes_outside_cloth(model: WorldModel) -> list[str]:

@@ -46,7 +46,7 @@ class AirDrag(AbstractEffect):
         normal: drag coefficient C_n >= 0; a flat plate has about 1.2.
         density: density of the air [kg/m^3], a constant.
         tangential: friction coefficient C_t >= 0 of both sides together; laminar flow at Re 3e4 has about 0.016.
-        wind: [3] m/s, velocity of the air in world axes. Learnable.
+        wind: [3] m/s, velocity of the air in world axes. Learnable, after ``wind.requires_grad_()``.
 
     Raises:
         InvalidInput: negative coefficient, non-positive density, or a wind that is not three finite numbers.
@@ -81,6 +81,7 @@ class AirDrag(AbstractEffect):
         ),
     }
     per_triangle = ("normal", "tangential")
+    world_facts = ("wind",)
     acts_on = "triangles"
 
     def __init__(
@@ -95,7 +96,8 @@ class AirDrag(AbstractEffect):
             raise InvalidInput("air density", got=f"{density} kg/m^3", expected="a value > 0")
         self.normal = PhysicalParameter(normal, "-", "nonnegative", name="air drag coefficient")
         self.tangential = PhysicalParameter(tangential, "-", "nonnegative", name="tangential air drag coefficient")
-        self.wind = nn.Parameter(parse_finite_numbers("wind", wind, 3, "three finite numbers in m/s").clone())
+        velocity = parse_finite_numbers("wind", wind, 3, "three finite numbers in m/s").clone()
+        self.wind = nn.Parameter(velocity, requires_grad=False)
         self.density = float(density)
         self.register_buffer("vertex_area", torch.zeros(0, 1), persistent=False)
         self.register_buffer("half_perimeter", torch.zeros(0, 1), persistent=False)

@@ -91,11 +91,14 @@ class AbstractEffect(nn.Module, ABC):
         per_triangle: names of the parameters that may have one value per triangle; all others are scalars or batches of
             scalars. None: not declared, so not checked.
         acts_on: whether ``force`` returns one row per vertex, or one per triangle (shared equally by its corners).
+        world_facts: names of the parameters that are facts about the world, not about the cloth. They require no
+            gradients until the user asks for them by ``requires_grad_``.
         grasp: name of the boundary whose grip ``grip_velocities`` changes; None: of none.
     """
 
     amplitudes: ClassVar[Mapping[str, Amplitude]]
     per_triangle: ClassVar[Collection[str] | None] = None
+    world_facts: ClassVar[Collection[str]] = ()
     acts_on: ClassVar[Literal["vertices", "triangles"]] = "vertices"
     grasp: str | None = None
 

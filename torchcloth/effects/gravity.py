@@ -17,9 +17,10 @@ class Gravity(AbstractEffect):
     """Uniform gravitational acceleration, f = m R_y R_x g.
 
     Args:
-        acceleration: [3] m/s^2 in world axes, z up. Learnable.
+        acceleration: [3] m/s^2 in world axes, z up. Learnable, after ``acceleration.requires_grad_()``.
         tilt: [2] rad, tilt of the world. The acceleration is turned by the first angle about world x, then by the
-            second about world y. Learnable: a robot base that is not level is a common calibration error.
+            second about world y. Learnable, after ``tilt.requires_grad_()``: a robot base that is not level is a common
+            calibration error.
 
     Raises:
         InvalidInput: not three, or two, finite numbers.
@@ -39,6 +40,8 @@ class Gravity(AbstractEffect):
             description="The world's vertical is not where gravity points: robot and camera share a base that leans.",
         ),
     }
+
+    world_facts = ("acceleration", "tilt")
 
     def __init__(
         self,
@@ -68,4 +71,4 @@ class Gravity(AbstractEffect):
 
 
 def _vector(name: str, values: Sequence[float], size: int, expected: str) -> nn.Parameter:
-    return nn.Parameter(parse_finite_numbers(name, values, size, expected).clone())
+    return nn.Parameter(parse_finite_numbers(name, values, size, expected).clone(), requires_grad=False)

@@ -109,7 +109,7 @@ def find_scalar_parameters(cloth: Cloth) -> dict[str, str]:
 
 def needs_contact(cloth: Cloth, path: str) -> bool:
     """Tell whether a parameter, given by its module path, does nothing because the model has no contact."""
-    return cloth.contact is None and path in ("material.contact_stiffness", "material.shear_stiffness", "material.cone")
+    return cloth.contact is None and path in [f"material.{name}" for name in cloth.material.contact_parameters]
 
 
 def collect_unknowns(

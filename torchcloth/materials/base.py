@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from typing import Any, NamedTuple
+from collections.abc import Collection
+from typing import Any, ClassVar, NamedTuple
 
 from torch import Tensor, nn
 
@@ -46,7 +47,13 @@ class AbstractMaterial(nn.Module, ABC):
     ``coefficients`` is called once per rollout. The other methods are pure functions of what it returned, ``c``, whose
     tensors broadcast with [..., E, 3]. For the director law they have one more axis, [..., E, 1, 1], and broadcast with
     n [..., E, 1, 3] and d3 [..., E, S, 3] (S contact points per triangle).
+
+    Attributes:
+        contact_parameters: names of the parameters that act in contact between layers only. In a cloth without contact
+            they require no gradients.
     """
+
+    contact_parameters: ClassVar[Collection[str]] = ()
 
     @property
     def has_axes(self) -> bool:

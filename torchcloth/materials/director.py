@@ -28,6 +28,8 @@ class DirectorMaterial(AbstractMaterial, ABC):
     The subclass's coefficients contain, under the same names, the entries of ``_director_coefficients``.
     """
 
+    contact_parameters = ("contact_stiffness", "shear_stiffness", "cone")
+
     def __init__(self, thickness: float) -> None:
         super().__init__()
         try:

@@ -148,7 +148,7 @@ class LearnedCloth(nn.Module):
         cloth = deepcopy(self.cloth)
         for name, raw in self.evaluate().items():
             cloth.get_submodule(self.paths[name]).raw = nn.Parameter(raw.clone())
-        return cloth.requires_grad_(True)
+        return cloth.require_default_gradients_()
 
 
 def triangle_centres(mesh: Mesh) -> Tensor:

@@ -44,7 +44,7 @@ def load(path: str | Path) -> Cloth:
         InvalidInput: no such file, or a cause that is not in the catalogue.
         RecordingError: a file that is damaged or no model.
     """
-    return load_world(path).cloth.requires_grad_(True)
+    return load_world(path).cloth.require_default_gradients_()
 
 
 def load_world(path: str | Path) -> World:
@@ -63,7 +63,7 @@ def load_cloth_for(path: str | Path, recording: Recording) -> Cloth:
         InvalidInput: as ``load``, or an episode with another fabric.
         RecordingError: as ``load``.
     """
-    return read_model(path, recording).model.build_world().cloth.requires_grad_(True)
+    return read_model(path, recording).model.build_world().cloth.require_default_gradients_()
 
 
 def make_start_builder(fit: str | Path) -> Callable[[Recording], Cloth] | None:
