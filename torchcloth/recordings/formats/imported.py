@@ -199,6 +199,8 @@ def parse_nanoseconds(text: str, place: str) -> int:
 
     try:
         value = Decimal(text) * NANOSECONDS_PER_SECOND
+        if value.is_finite() and abs(value) > checks.MAX_EPOCH_S * NANOSECONDS_PER_SECOND:
+            checks.check_increasing(np.array([float(text)]), place)
         if not value.is_finite() or abs(value) > 2**62:
             raise InvalidOperation
         return int(value)

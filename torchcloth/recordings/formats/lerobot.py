@@ -9,9 +9,10 @@ and unit must be given by the user:
                                    "width": "gripper.width", "width_scale": 1.0, "closed": true}},
                "cameras": {"cam0": {"color": "observation.images.top"}}}
 
-Joints and width are names (of info.json) or indices. Times are those of the data set's regular clock.
+Joints and width are names (of info.json) or indices. Times are those of the data set's regular clock, or the
+``timestamp`` column if it holds the hardware's times.
 
-Checked are: page checksums if there are any; one row and one video frame for every tick of that clock; and smallest,
+Checked are: page checksums if there are any; one row and one video frame for every tick of the clock; and smallest,
 largest and mean value of every column against the statistics that LeRobot stores for each episode. Changed bytes that
 decode to another picture are not detected, for AV1 and H.264 carry no checksum.
 """
@@ -40,6 +41,8 @@ LEROBOT_SOURCE_EXAMPLE = (
 )
 LEROBOT_UNCHECKED = "pixels"
 LEROBOT_TIME_TOLERANCE_S = 1e-4  # LeRobot's own for video and row times
+MAX_JITTER_FRACTION = 0.9  # of the clock's interval, by which an interval of the hardware may differ
+MIN_JITTERING_FRACTION = 0.3  # of the intervals; a few irregular ones are damage
 MAX_VIDEO_DURATION_S = 1e6  # of one file
 STATISTICS_TOLERANCE = 1e-5  # relative; statistics are stored in float64, values in float32
 FLOAT32_ROUNDING = 2.0**-24  # error per row of a float32 sum; means are computed from such sums
@@ -75,11 +78,14 @@ def read(path: Path, scene: SceneFile, episode: int | None) -> Imported:
     imported = Imported(
         notes={"format": LEROBOT_NAME, "episode": int(row["episode_index"]), "fps": fps, "unchecked": LEROBOT_UNCHECKED}
     )
-    t = np.arange(len(table["frame_index"])) / fps
+    ticks = np.arange(len(table["frame_index"])) / fps
+    t = _times(table, row, ticks, str(path))
+    if t is not ticks:
+        imported.notes["repairs"] = [f"times are those of the column timestamp, not of the clock of {fps:g} Hz"]
     for name, fields in source.named_groups("motion").items():
         imported.motion[name] = _motion(fields, features, table, row, t)
     for name, fields in source.named_groups("cameras").items():
-        imported.cameras[name] = _camera(path, fields, info, features, row, t)
+        imported.cameras[name] = _camera(path, fields, info, features, row, ticks, t)
     reject_unknown_keys(source)
     return imported
 
@@ -143,17 +149,33 @@ def _table(path: Path, info: Fields, features: Fields, row: dict[str, Any], fps:
     expected = {
         "frame_index": np.arange(length),
         "index": np.arange(first, first + length),
-        "timestamp": np.arange(length) / fps,
     }
     for key, values in expected.items():
         column = checks.check_array(table.get(key), f"{place}, {key}", (length,))
-        if not np.allclose(column, values, rtol=0, atol=LEROBOT_TIME_TOLERANCE_S if key == "timestamp" else 0):
+        if not np.array_equal(column, values):
             i = int(np.argmax(np.abs(column - values)))
             got = f"{column[i]:g} in row {i}"
             raise RecordingError(f"{place}, {key} is not regular", got=got, expected=f"{values[i]:g}")
     if _whole(row, "dataset_to_index") - first != length:
         raise RecordingError(f"{row['file']} contradicts itself", got=f"length {length}", expected="its indices")
     return table
+
+
+def _times(table: dict[str, np.ndarray], row: dict[str, Any], ticks: np.ndarray, path: str) -> np.ndarray:
+    """Times of the rows: ``ticks``, or the column ``timestamp`` where it holds the hardware's times, which jitter."""
+    place = f"{path}: episode {row['episode_index']}, timestamp"
+    t = checks.check_array(table.get("timestamp"), place, ticks.shape)
+    if np.allclose(t, ticks, rtol=0, atol=LEROBOT_TIME_TOLERANCE_S):
+        return ticks
+    checks.check_increasing(t, place)
+    step, interval = np.diff(t), ticks[1] if len(ticks) > 1 else 0.0
+    off = np.abs(step - interval) > MAX_JITTER_FRACTION * interval
+    jitters = (np.abs(step - interval) > LEROBOT_TIME_TOLERANCE_S).mean() if len(step) else 0.0
+    if off.any() or jitters < MIN_JITTERING_FRACTION:
+        i = int(np.argmax(np.abs(t - ticks)))
+        raise RecordingError(f"{place} is not regular", got=f"{t[i]:g} in row {i}", expected=f"{ticks[i]:g}")
+    _check_statistics(t[:, None], row, "timestamp")
+    return t
 
 
 def _motion(fields: Fields, features: Fields, table: dict, row: dict[str, Any], t: np.ndarray) -> dict[str, np.ndarray]:
@@ -232,9 +254,15 @@ def _check_statistics(values: np.ndarray, row: dict[str, Any], column: str) -> N
 
 
 def _camera(
-    path: Path, fields: Fields, info: Fields, features: Fields, row: dict[str, Any], t: np.ndarray
+    path: Path,
+    fields: Fields,
+    info: Fields,
+    features: Fields,
+    row: dict[str, Any],
+    ticks: np.ndarray,
+    t: np.ndarray,
 ) -> ImportedCamera:
-    """A camera whose colour images are a section of a video."""
+    """A camera whose colour images are a section of a video, which runs by ``ticks``; they were taken at ``t``."""
     key = fields.text("color")
     reject_unknown_keys(fields)
     if not features.has(key):
@@ -255,14 +283,14 @@ def _camera(
     start = row.get(f"videos/{key}/from_timestamp")
     end = row.get(f"videos/{key}/to_timestamp")
     span = checks.check_array([start, end], f"{row['file']}: videos/{key}", (2,))
-    step = t[1] if len(t) > 1 else span[1] - span[0]
+    step = ticks[1] if len(ticks) > 1 else span[1] - span[0]
     if (
         not 0 <= span[0] <= MAX_VIDEO_DURATION_S
         or abs(span[1] - span[0] - len(t) * step) > LEROBOT_TIME_TOLERANCE_S * 10
     ):
         got = f"{span[1] - span[0]:g} s for {len(t)} frames"
         raise RecordingError(f"{row['file']}: videos/{key} does not last", got=got, expected=f"{len(t) * step:g} s")
-    times = np.round((span[0] + t) * NANOSECONDS_PER_SECOND).astype(np.int64)
+    times = np.round((span[0] + ticks) * NANOSECONDS_PER_SECOND).astype(np.int64)
     frames = VideoFrames(file, 0, "color", times, round(LEROBOT_TIME_TOLERANCE_S * NANOSECONDS_PER_SECOND))
     stream = ImageStream("color", np.arange(len(t)), t, (), size, frames)
     return ImportedCamera({"width": size[0], "height": size[1]}, {"color": stream})
