@@ -280,7 +280,7 @@ def copy_lerobot(folder: Path) -> ForeignRecording:
     scene = {
         **SCENE_DESCRIPTION,
         "source": source,
-        "cameras": {"cam0": {"T_world_camera": CAMERA_POSE, "K": INTRINSICS_PX}},
+        "cameras": {"cam0": {"T_world_camera": CAMERA_POSE, "K": [[84.0, 0, 47.5], [0, 85.0, 31.5], [0, 0, 1]]}},
     }
     length = lerobot_truth.EPISODE_LENGTHS[1]
     states = np.array([lerobot_truth.make_state(1, i) for i in range(length)], dtype=np.float64)

@@ -11,6 +11,7 @@ from ..errors import InvalidInput, RecordingError
 from ..meshes import obj
 from ..meshes.mesh import MAX_AREAL_DENSITY_KG_PER_M2, check_metres, corner_to_vertex_values
 from . import checks
+from .camera_checks import check_matrix_fits_images
 from .checks import Fields
 from .files import Folder
 from .images import ImageKind, ImageStream
@@ -109,6 +110,8 @@ def read_camera(fields: Fields, images_of: Callable[[tuple[int, int]], dict[Imag
             f"{fields.location('K')} is no camera matrix", got=got, expected="[[fx, s, cx], [0, fy, cy], [0, 0, 1]]"
         )
     streams = images_of(size)
+    if streams:
+        check_matrix_fits_images(matrix, size, fields.location("K"))
     if "depth" in streams and not fields.has("depth_scale"):
         raise RecordingError(
             f"{fields.location('depth_scale')} is missing", expected="metres per unit", remedy="0.001 for mm"

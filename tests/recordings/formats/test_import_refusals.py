@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import shutil
 import sqlite3
 from types import SimpleNamespace
@@ -463,3 +464,72 @@ def test_files_with_a_byte_order_mark_are_read(copy, name, files):
     scene = truth.write_scene()
     scene.write_text(scene.read_text(), encoding="utf-8-sig")
     assert formats.read(truth.path, scene=scene).cameras["cam0"].depth is not None
+
+
+def rewrite_timestamps(truth: foreign_formats.ForeignRecording, offsets: np.ndarray) -> np.ndarray:
+    """Add offsets [8] s to the times of episode 1, with its statistics; returns the times."""
+    import pyarrow
+    from pyarrow import parquet
+
+    data, meta = (truth.path / name / "chunk-000" / "file-000.parquet" for name in ("data", "meta/episodes"))
+    table = parquet.read_table(data)
+    t = np.array(table.column("timestamp").to_pylist(), np.float32)
+    t[6:] += offsets.astype(np.float32)
+    column = table.column_names.index("timestamp")
+    parquet.write_table(table.set_column(column, "timestamp", pyarrow.array(t)), data)
+    table = parquet.read_table(meta)
+    for name in ("min", "max", "mean"):
+        key = f"stats/timestamp/{name}"
+        rows = table.column(key).to_pylist()
+        rows[1] = [float(getattr(t[6:].astype(float), name)())]
+        values = pyarrow.array(rows, type=table.schema.field(key).type)
+        table = table.set_column(table.column_names.index(key), key, values)
+    parquet.write_table(table, meta)
+    return t[6:].astype(float)
+
+
+def test_lerobot_times_of_the_hardware_are_read(copy):
+    """A jitter of 3 ms: the regular clock would be wrong by as much."""
+    truth = copy("lerobot")
+    t = rewrite_timestamps(truth, np.array([0, 3, -3, 2, -1, 3, -2, 1]) * 1e-3)
+    recording = formats.read(truth.path, scene=truth.write_scene(), **truth.options)
+    np.testing.assert_array_equal(recording.joints["left"].t, t)
+    color = recording.cameras["cam0"].color
+    np.testing.assert_array_equal(color.t, t)
+    assert abs(int(color.load(7).mean()) - foreign_formats.lerobot_truth.grey_level(1, 7)) <= 2
+    note = "times are those of the column timestamp, not of the clock of 10 Hz"
+    assert recording.extra["source"]["repairs"] == [note]
+
+
+@pytest.mark.parametrize("offsets", [[0, 0, 0, 0.03, 0, 0, 0, 0], [0, 0.2, 0.1, 0.1, 0.1, 0.1, 0.1, 0.1]])
+def test_lerobot_times_of_damage_are_refused(copy, offsets):
+    truth = copy("lerobot")
+    rewrite_timestamps(truth, np.array(offsets))
+    refuse(truth, "timestamp is not regular|timestamp does not increase")
+
+
+@pytest.mark.parametrize(
+    ("K", "match"),
+    [
+        ([[0.8, 0, 0.5], [0, 1.07, 0.5], [0, 0, 1]], "cameras.cam0.K looks normalised; .*first row by the width"),
+        ([[28.0, 0, 15.5], [0, 30, 11.5], [0, 0, 1]], r"looks like that of images 1\.93 times as large"),
+        ([[7.5, 0, 14], [0, 5.25, 15], [0, 0, 1]], "cameras.cam0.K has fx, fy and cx, cy exchanged"),
+    ],
+)
+def test_a_camera_matrix_of_other_images(copy, K, match):
+    truth = copy("tum")
+    for name in ("depth", "rgb"):
+        for file in (truth.path / name).iterdir():
+            with Image.open(file) as image:
+                image.resize((32, 24)).save(file)
+    K = np.array(K) * [[2, 2, 2], [2, 2, 2], [1, 1, 1]] if K[0][0] > 4 else K
+    truth.scene["cameras"]["cam0"]["K"] = np.array(K).tolist()
+    refuse(truth, match)
+
+
+def test_times_in_milliseconds_since_1970(copy):
+    truth = copy("tum")
+    for file in ("rgb.txt", "depth.txt", "groundtruth.txt"):
+        path = truth.path / file
+        path.write_text(re.sub(r"^1305031102\.(\d{3})", r"1305031102\1.", path.read_text(), flags=re.MULTILINE))
+    refuse(truth, r"looks like milliseconds; got 1305031102187; expected seconds; divide the stamps by 1000")
