@@ -441,6 +441,7 @@ def test_what_the_system_says_is_said_like_everything_else(folder, tmp_path, cap
     assert f"torchcloth: {said}" in refuse(capsys, tmp_path / "out", "identify", folder)
 
 
+@pytest.mark.filterwarnings("default:settle")
 def test_what_the_library_warns_of_is_one_line(monkeypatch, capsys):
     def run(options):
         warnings.warn("settle: the cloth still moves", stacklevel=1)

@@ -24,6 +24,9 @@ from torchcloth.training.studies.manipulations.scenes import (
 
 SMALL = cases.Setup(triangles=90, gap=0.09, rate=6.0, points=60, iterations=1)
 
+# Why: training/studies/manipulations/scenes.py.
+pytestmark = pytest.mark.filterwarnings("ignore:contact. 100 % of the triangles")
+
 
 # -- scenes ----------------------------------------------------------------------------------------------------------
 
@@ -94,7 +97,6 @@ def solved():
 
 
 @pytest.mark.slow
-@pytest.mark.filterwarnings("ignore:contact. 100 % of the triangles")  # why: training/studies/manipulations/scenes.py
 def test_a_case_holds_estimates_and_distances(solved):
     assert solved["truth"]["youngs_modulus"] == pytest.approx(129320)
     assert set(solved["estimates"]) == {*cases.PAPER_PARAMETERS, *cases.EXTRA_PARAMETERS}
@@ -182,6 +184,7 @@ def test_three_studies_share_their_cases(solved, tmp_path, monkeypatch, capsys):
         assert (tmp_path / f"{name}.png").stat().st_size > 10_000
 
 
+@pytest.mark.slow
 def test_a_failed_case_is_counted_and_no_number(solved, tmp_path, monkeypatch, capsys):
     case = {key: solved[key] for key in ("truth", "hidden")}
     monkeypatch.setattr(
@@ -213,6 +216,7 @@ def test_refusals_write_nothing(arguments, message, tmp_path, capsys):
     assert not (tmp_path / "out").exists()
 
 
+@pytest.mark.slow
 def test_another_setting_needs_another_folder(solved, tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(study_cases, "solve_case", pretended(solved, 1.0))
     assert call("garments", tmp_path, "--garments", "dress") == 0

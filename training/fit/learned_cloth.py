@@ -175,11 +175,11 @@ def import_network(name: str) -> type[nn.Module]:
     """
     where, _, attribute = name.rpartition(".")
     try:
-        found = getattr(import_module(where), attribute)
+        candidate = getattr(import_module(where), attribute)
     except Exception as error:  # the user's code may raise anything
         expected = "package.module.Class that can be imported"
         raise InvalidInput("config: learn.network", got=f"{name} ({error})", expected=expected) from None
-    return _check_network_class(name, found)
+    return _check_network_class(name, candidate)
 
 
 def find_imported_network(name: str) -> type[nn.Module]:
@@ -189,22 +189,22 @@ def find_imported_network(name: str) -> type[nn.Module]:
         InvalidInput: its module is not imported, or it is no subclass of torch.nn.Module.
     """
     where, _, attribute = name.rpartition(".")
-    found = vars(sys.modules[where]).get(attribute) if where in sys.modules else None
-    if found is None:
+    candidate = vars(sys.modules[where]).get(attribute) if where in sys.modules else None
+    if candidate is None:
         raise InvalidInput(
             "checkpoint: learn.network",
             got=f"{name}, which is not imported",
             expected="a class that is imported before the checkpoint is loaded",
             remedy="import it, or load_from_checkpoint(FILE, network_class=CLASS)",
         )
-    return _check_network_class(name, found)
+    return _check_network_class(name, candidate)
 
 
-def _check_network_class(name: str, found: object) -> type[nn.Module]:
+def _check_network_class(name: str, candidate: object) -> type[nn.Module]:
     """Refuse everything but a subclass of nn.Module, before it is called."""
-    if not (isinstance(found, type) and issubclass(found, nn.Module)):
+    if not (isinstance(candidate, type) and issubclass(candidate, nn.Module)):
         raise InvalidInput("config: learn.network", got=name, expected="a subclass of torch.nn.Module")
-    return found
+    return candidate
 
 
 def _build_network(network: Network, network_class: type[nn.Module]) -> nn.Module:

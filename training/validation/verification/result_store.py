@@ -86,7 +86,7 @@ def _write(file: Path, digests: dict[str, str], outcome: Outcome) -> None:
 
 def _read(file: Path) -> tuple[dict[str, str], Outcome] | None:
     try:
-        with np.load(file) as stored:
+        with np.load(io.BytesIO(file.read_bytes())) as stored:  # by name, a damaged archive stays open
             head = json.loads(str(stored["__head__"]))
             data = {name: stored[name] for name in stored.files if name != "__head__"}
         rows = [
