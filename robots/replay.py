@@ -11,6 +11,7 @@ from torch import Tensor
 from torchcloth.errors import RecordingError
 from torchcloth.recordings import GripperMotion, JointMotion, Recording
 from torchcloth.recordings.consistency import check_recording
+from torchcloth.recordings.files import is_present
 from torchcloth.types import Trajectory
 
 from .arm import Arm, load
@@ -96,7 +97,7 @@ def locate_model(recording: Recording, name: str) -> str:
     """Return what an arm of an episode is loaded by: the path of a URDF file in the episode, or the model's name."""
     model = recording.robots[name].model
     file = None if recording.path is None else recording.path / model
-    return model if file is None or not file.is_file() else str(file.resolve())
+    return model if file is None or not is_present(file) or not file.is_file() else str(file.resolve())
 
 
 def _tensor(array: np.ndarray) -> Tensor:

@@ -368,3 +368,47 @@ def test_files_with_a_byte_order_mark_are_read(episode, assert_same):
         path = episode / name
         path.write_text(path.read_text(encoding="utf-8"), encoding="utf-8-sig")
     assert_same(rec.read(episode), before)
+
+
+URDF = '<robot name="a"><link name="tip"><visual><geometry><mesh filename="{}"/></geometry></visual></link></robot>'
+
+
+@pytest.fixture
+def with_urdf(recording, tmp_path) -> rec.Recording:
+    """An episode whose arm is described by a file beside it, with one mesh beside that and one elsewhere."""
+    folder = tmp_path / "lab" / "arms"
+    (folder / "meshes").mkdir(parents=True)
+    (folder / "meshes" / "tip.stl").write_bytes(b"solid")
+    (tmp_path / "lab" / "secret").write_text("secret")
+    text = URDF.format("meshes/tip.stl") + URDF.format("../secret") + URDF.format("package://arms/tip.stl")
+    (folder / "arm.urdf").write_text(text)
+    robots = {**recording.robots, "right": replace(recording.robots["right"], model="arms/arm.urdf")}
+    return replace(recording, robots=robots, path=tmp_path / "lab")
+
+
+def test_a_urdf_beside_the_episode_is_copied_with_it(with_urdf, tmp_path):
+    episode = rec.write(with_urdf, tmp_path / "ep")
+    back = rec.read(episode)
+    assert back.robots["right"].model == "robots/right/arm.urdf"
+    assert back.robots["spare"].model == "homemade"
+    assert (episode / back.robots["right"].model).read_text() == (tmp_path / "lab" / "arms" / "arm.urdf").read_text()
+    assert (episode / "robots" / "right" / "meshes" / "tip.stl").read_bytes() == b"solid"
+    assert sorted(p.name for p in (episode / "robots").rglob("*") if p.is_file()) == ["arm.urdf", "tip.stl"]
+    again = rec.write(back, tmp_path / "again")
+    assert (again / "robots" / "right" / "arm.urdf").is_file()
+    assert rec.write(rec.read(again), again, overwrite=True) == again
+    assert (again / "robots" / "right" / "arm.urdf").is_file()
+
+
+def test_a_model_that_is_no_urdf_is_not_copied(with_urdf, tmp_path):
+    (tmp_path / "lab" / "arms" / "arm.urdf").write_text("root:x:0:0")
+    with pytest.raises(RecordingError, match="is no URDF"):
+        rec.write(with_urdf, tmp_path / "ep")
+    assert not (tmp_path / "ep").exists()
+
+
+def test_a_camera_may_be_called_robots(with_urdf, tmp_path):
+    cameras = {"robots": with_urdf.cameras["cam0"]}
+    back = rec.read(rec.write(replace(with_urdf, cameras=cameras), tmp_path / "ep"))
+    assert back.robots["right"].model == "robots_/right/arm.urdf"
+    assert back.cameras["robots"].depth is not None

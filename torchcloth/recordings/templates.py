@@ -7,9 +7,10 @@ from pathlib import Path
 
 from ..errors import TorchclothError
 from .reading import read
+from .robot_files import ROBOTS_FOLDER
 from .types import Recording
 
-TEMPLATE_FILES = frozenset(("episode.json", "motion.npz", "cloth.obj", "cloth_initial.npy"))
+TEMPLATE_FILES = frozenset(("episode.json", "motion.npz", "cloth.obj", "cloth_initial.npy", ROBOTS_FOLDER))
 
 
 def as_template(recording: Recording, provenance: str) -> Recording:

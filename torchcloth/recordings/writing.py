@@ -17,6 +17,7 @@ from .atomic_write import write_folder_atomically
 from .consistency import check_recording
 from .files import Folder, save_npz
 from .reading import EPISODE_FILE, EPISODE_FORMAT, EPISODE_SCHEMA, EPISODE_VERSION, read_folder
+from .robot_files import copy_robot_files
 from .types import Camera, ClothInfo, GraspInfo, Recording
 
 MESH_FILE, INITIAL_VERTICES_FILE = "cloth.obj", "cloth_initial.npy"
@@ -35,7 +36,7 @@ def write(
 
     The final name only ever holds a complete episode. Overwriting moves the old folder aside first and moves it back if
     anything fails (after a power cut it lies next to it as ``.NAME.*.old``). Files in it that the recording does not
-    hold, such as truth that was not read, are removed.
+    hold, such as truth that was not read, are removed. URDF files that it names are copied into the episode.
 
     Args:
         recording: to write.
@@ -62,6 +63,7 @@ def write(
 def _fill(part: Path, recording: Recording, compact: bool, on_image: Callable[[], None]) -> None:
     if recording.cloth is None:
         raise InvalidInput("recording.cloth", got="None", expected="a ClothInfo: what the cloth is")
+    recording = copy_robot_files(recording, part)
     text = json.dumps(build_episode_json(recording), indent=1, allow_nan=False, default=to_json_value)
     (part / EPISODE_FILE).write_text(text + "\n", encoding="utf-8")
     _write_cloth(part, recording.cloth)

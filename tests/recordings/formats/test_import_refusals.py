@@ -533,3 +533,14 @@ def test_times_in_milliseconds_since_1970(copy):
         path = truth.path / file
         path.write_text(re.sub(r"^1305031102\.(\d{3})", r"1305031102\1.", path.read_text(), flags=re.MULTILINE))
     refuse(truth, r"looks like milliseconds; got 1305031102187; expected seconds; divide the stamps by 1000")
+
+
+def test_a_urdf_beside_the_scene_goes_into_the_episode(copy, tmp_path):
+    truth = copy("ros2")
+    (tmp_path / "my.urdf").write_text('<robot name="mine"><link name="flange"/></robot>')
+    truth.scene["robots"]["arm"]["model"] = "my.urdf"
+    recording = formats.read(truth.path, scene=truth.write_scene())
+    assert recording.robots["arm"].model == str((tmp_path / "my.urdf").resolve())
+    episode = rec.write(recording, tmp_path / "ep")
+    assert rec.read(episode).robots["arm"].model == "robots/arm/my.urdf"
+    assert (episode / "robots" / "arm" / "my.urdf").is_file()

@@ -12,6 +12,7 @@ from .. import checks, reading, streams
 from ..checks import Fields
 from ..files import Folder
 from ..images import ImageKind, ImageStream
+from ..robot_files import locate_urdf_file
 from ..types import Recording
 from . import scene_file_keys
 from .imported import Imported, ImportedCamera
@@ -86,6 +87,7 @@ class SceneFile:
         self._check_camera_names(imported, path)
         self._require(values, imported, path)
         values["cameras"] = self._cameras(imported.cameras)
+        values["robots"] = self._robots()
         values["source"] = imported.notes
         grippers, joints = streams.parse_motions(imported.motion, str(path))
         points = None if imported.points is None else streams.parse_points(imported.points, str(path))
@@ -136,6 +138,16 @@ class SceneFile:
         entries = {**camera.calibration, **self.camera_entry(name)}
         pose = [] if camera.placed_by or "T_world_camera" in entries else [CAMERA_POSE_EXAMPLE]
         return pose if "K" in entries else [CAMERA_MATRIX_EXAMPLE, *pose]
+
+    def _robots(self) -> Any:
+        """Robots of the scene file; a URDF beside it is named by its whole path."""
+        robots = self.values.get("robots")
+        located = {}
+        for name, entry in robots.items() if isinstance(robots, dict) else ():
+            model = entry.get("model") if isinstance(entry, dict) else None
+            file = locate_urdf_file(model, self.folder.path) if isinstance(model, str) else None
+            located[name] = entry if file is None else {**entry, "model": str(file)}
+        return located if isinstance(robots, dict) else robots
 
     def _cameras(self, imported: dict[str, ImportedCamera]) -> dict[str, Any]:
         """Cameras of the scene file and of the file; the file wins, and a contradiction is refused."""
