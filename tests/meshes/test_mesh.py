@@ -463,3 +463,20 @@ def test_load_reads_an_obj_with_a_byte_order_mark(tmp_path):
     path = tmp_path / "sheet.obj"
     path.write_text("v 0 0 0\nv 0.1 0 0\nv 0 0.1 0\nf 1 2 3\n", encoding="utf-8-sig")
     assert tc.meshes.load(path).vertices.tolist() == [[0, 0, 0], [0.1, 0, 0], [0, 0.1, 0]]
+
+
+@pytest.mark.parametrize("ratio", [10, 2000])
+def test_a_triangle_that_is_much_flatter_than_the_others_is_named(ratio):
+    """It shortens the step by as much, so a fit of minutes takes days."""
+    flat = tc.meshes.rectangle(0.3, 0.3, triangles=200)
+    a, b, c = flat.faces[90]
+    corner, edge, side = flat.vertices[a], *(flat.vertices[k] - flat.vertices[a] for k in (b, c))
+    height = side - edge * (side @ edge) / (edge @ edge)
+    x = np.vstack([flat.vertices, corner + edge / 2 + height / ratio])
+    k = len(flat.vertices)
+    faces = np.vstack([np.delete(flat.faces, 90, axis=0), [[a, b, k], [b, c, k], [c, a, k]]])
+    if ratio == 10:
+        assert len(Mesh.build(x, faces, x[:, :2]).faces) == len(faces)
+        return
+    with pytest.warns(UserWarning, match=r"triangle 199 is 1414 times flatter .* mm high; the stable step"):
+        Mesh.build(x, faces, x[:, :2])

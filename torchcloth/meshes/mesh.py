@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
@@ -17,6 +18,7 @@ MAX_EVEN_EDGE_RATIO = 1.5  # longest over mean edge of an even mesh; ours have 1
 MAX_PATTERN_EDGE_RATIO = 1.2
 MAX_UNIT_SQUARE_EDGE_RATIO = 1.05  # of a pattern that fills the unit square, and so may be a texture
 IGNORED_EDGE_FRACTION = 0.1  # at each end of these ratios: edges that are gathered or stretched where the cloth lies
+MAX_FLATNESS_RATIO = 20.0  # median height of the triangles over the smallest; ours have 1.6
 MAX_CLOTH_SPAN_M = 20.0  # a longer cloth is taken to be in millimetres
 MAX_AREAL_DENSITY_KG_PER_M2 = 20.0  # a heavier cloth is taken to be in g/m^2
 
@@ -73,6 +75,7 @@ class Mesh:
                 expected="positive area in the rest shape",
             )
         _check_winding(f)
+        _warn_of_flat_triangles(rest)
         named = {name: _check_place(name, np.array(index), len(x)) for name, index in (places or {}).items()}
         return Mesh(x, f, rest, pattern, named)
 
@@ -323,6 +326,22 @@ def _check_triangles(x: np.ndarray, f: np.ndarray) -> None:
             got=f"{len(unused)} in no triangle (first: {unused[0]})",
             expected="every vertex in a triangle",
             remedy="a vertex without area has no mass; remove it",
+        )
+
+
+def _warn_of_flat_triangles(rest: np.ndarray) -> None:
+    """Warn of triangles [F, 3, 2] m that are much flatter than most: the stable step is in proportion to the height."""
+    longest = np.linalg.norm(rest - np.roll(rest, 1, axis=1), axis=-1).max(1)
+    height = 2 * np.abs(signed_area(rest)) / longest
+    typical, flattest = float(np.median(height)), int(np.argmin(height))
+    count = int((height * MAX_FLATNESS_RATIO < typical).sum())
+    if count:
+        ratio = typical / height[flattest]
+        more = f" ({count - 1} more are over {MAX_FLATNESS_RATIO:g} times flatter)" if count > 1 else ""
+        warnings.warn(
+            f"triangle {flattest} is {ratio:.0f} times flatter than the median, {1e3 * height[flattest]:.2g} mm "
+            f"high{more}; the stable step becomes up to {ratio:.0f} times shorter: remesh, or merge its vertices",
+            stacklevel=3,
         )
 
 
