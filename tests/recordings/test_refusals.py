@@ -400,6 +400,31 @@ def test_initial_vertices_of_another_mesh(episode):
     refused(episode, r"cloth_initial.npy has the wrong shape; got \[5, 3\]; expected \[12, 3\]")
 
 
+def test_initial_vertices_in_another_order(episode):
+    """As of a loader that sorts or merges vertices: every edge would be stretched, and the cloth would explode."""
+    initial = np.load(episode / "cloth_initial.npy")
+    np.save(episode / "cloth_initial.npy", initial[np.random.default_rng(0).permutation(len(initial))])
+    refused(
+        episode,
+        r"cloth_initial.npy is not a shape of this mesh; got edges up to 3\.\d times their rest length; .*reord",
+    )
+
+
+def test_an_initial_grid_in_another_order(episode):
+    edit_json(episode, ("cloth", "mesh"), DROP)
+    grid = np.load(episode / "cloth_initial.npy").reshape(4, 3, 3)
+    np.save(episode / "cloth_initial.npy", grid)
+    rec.read(episode)
+    np.save(episode / "cloth_initial.npy", np.random.default_rng(0).permutation(grid.reshape(12, 3)).reshape(4, 3, 3))
+    refused(episode, "is not a shape of this mesh; got edges up to")
+
+
+def test_a_cloth_that_is_stretched_and_measured_with_noise_is_read(episode):
+    initial = np.load(episode / "cloth_initial.npy") * [1.5, 1.0, 1.0]
+    np.save(episode / "cloth_initial.npy", initial + np.random.default_rng(0).normal(0, 5e-3, initial.shape))
+    rec.read(episode)
+
+
 def test_grasps_need_pattern_coordinates(episode):
     edit_json(episode, ("cloth", "sheet"), None)
     (episode / "markers.npz").unlink()

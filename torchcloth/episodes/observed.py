@@ -24,6 +24,7 @@ from ..meshes.patches import Patch
 from ..recordings import Camera, Recording
 from ..recordings.consistency import as_list, check_same_cloth, merge_scene
 from ..recordings.fingerprints import reject_duplicates
+from ..recordings.initial_shape import check_initial_shape
 from ..recordings.scene import DEFAULT_TABLE_FRICTION, DEFAULT_THICKNESS_M
 from ..recordings.size_checks import check_size
 from ..robots import list_closing_grippers, replay  # pyright: ignore[reportMissingImports] - mapped from robots/ at installation
@@ -399,6 +400,7 @@ def compute_initial_vertices(name: str, cloth: Cloth, recording: Recording) -> T
         )
     if initial is None:
         return torch.as_tensor(vertices)
+    check_initial_shape(recording.cloth, f"{name}: initial_vertices")
     return transfer_vertices(cloth.mesh, recording, torch.as_tensor(initial))
 
 

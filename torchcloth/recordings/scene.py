@@ -15,6 +15,7 @@ from .camera_checks import check_matrix_fits_images
 from .checks import Fields
 from .files import Folder
 from .images import ImageKind, ImageStream
+from .initial_shape import check_initial_shape
 from .types import Camera, ClothInfo, Collider, GraspInfo, RobotInfo
 
 MAX_THICKNESS_M = 0.05
@@ -43,7 +44,7 @@ def read_cloth(fields: Fields, folder: Folder) -> ClothInfo:
             f"{fields.place} has no shape", expected="mesh or sheet", remedy="name cloth.obj or a sheet"
         )
     vertices, faces, uv = (None, None, None) if mesh is None else _mesh(folder, mesh)
-    return ClothInfo(
+    cloth = ClothInfo(
         **read_fabric(fields),
         sheet=_sheet(sheet) if sheet.remaining else None,
         vertices=vertices,
@@ -52,6 +53,8 @@ def read_cloth(fields: Fields, folder: Folder) -> ClothInfo:
         initial_vertices=None if start is None else _initial(folder, start, vertices),
         extra=fields.unknown_keys(sheet=sheet),
     )
+    check_initial_shape(cloth, folder.location(start or ""))
+    return cloth
 
 
 def read_fabric(fields: Fields) -> dict[str, Any]:
