@@ -30,7 +30,7 @@ class Floor(AbstractBoundary):
 
 def outcome(engine, batch=(), settle=False, checkpoint=True, times=TIMES, **options):
     """All that comes out of a simulation, and all gradients."""
-    cloth = make_sheet(engine, **options)
+    cloth = make_sheet(engine, **options).requires_grad_(True)  # also facts
     motion = make_opening_motion(END)
     leaves = {name: t.pose.clone().requires_grad_() for name, t in motion.items()}
     motion = {name: t._replace(pose=leaves[name]) for name, t in motion.items()}

@@ -57,7 +57,7 @@ class BoundaryContract(Contract):
 
     def _boundary(self) -> AbstractBoundary:
         with float64():
-            return self.make().double().bind(self.mesh()).double()
+            return self.make().double().bind(self.mesh()).double().requires_grad_()
 
     def _travel(self) -> Tensor:
         """[K, 4, 4]: from the origin, a turn about a tilted axis while the body travels."""

@@ -89,7 +89,7 @@ class ColliderContract(BoundaryContract):
 
     def test_is_finite_everywhere(self) -> None:
         """Distances, normals and derivatives are finite at centres, axes, edges and far away."""
-        body = self._body()
+        body = self._body().requires_grad_()
         p = self._lattice().requires_grad_()
         distance, normal = body.clearance(p)
         require(torch.isfinite(distance).all() and torch.isfinite(normal).all(), "distance or normal is not finite")

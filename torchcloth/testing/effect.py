@@ -54,7 +54,7 @@ class EffectContract(Contract):
     def _effect(self, amplitude: float | None = None) -> AbstractEffect:
         with float64():
             size = self._size(self.make(0.0)).typical if amplitude is None else amplitude
-            return self.make(size).double().bind(self.mesh()).double()
+            return self.make(size).double().bind(self.mesh()).double().requires_grad_()
 
     def _size(self, effect: AbstractEffect) -> Amplitude:
         amplitudes = getattr(type(effect), "amplitudes", {})

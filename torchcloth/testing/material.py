@@ -90,7 +90,7 @@ class MaterialContract(Contract):
 
     def _material(self) -> AbstractMaterial:
         with float64():
-            return self.make().double()
+            return self.make().double().requires_grad_()
 
     def _columns(self) -> dict[str, Tensor]:
         return dict(zip(("f1", "f2"), samples.frames(self.triangles, self.strain, 0), strict=True))
