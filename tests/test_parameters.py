@@ -152,7 +152,9 @@ def everything():
     effects = {"gravity": tc.effects.Gravity(), "air": tc.effects.AirDrag(1.1), "bending": tc.effects.Bending(2e-5)}
     boundaries = {"table": tc.boundaries.Plane((0.0, 0.0, -0.1), friction=0.3), "hand": tc.boundaries.Grasp([0])}
     mesh = tc.meshes.rectangle(0.2, 0.2, resolution=(4, 4))
-    return tc.Cloth(mesh, tc.materials.AEP(1e5, 0.3, 1e6, 2e5), 0.2, effects, boundaries)
+    return tc.Cloth(
+        mesh, tc.materials.AEP(1e5, 0.3, contact_stiffness=1e6, shear_stiffness=2e5), 0.2, effects, boundaries
+    )
 
 
 def simulated(cloth):

@@ -6,7 +6,7 @@ import warnings
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
 from itertools import pairwise
-from typing import Self, cast
+from typing import Literal, Self, cast
 
 import numpy as np
 import torch
@@ -75,8 +75,10 @@ class Cloth(nn.Module):
         areal_density: rho_A [kg/m^2]; scalar or one value per triangle; learnable.
         effects: by name, e.g. ``{"gravity": Gravity(), "air": AirDrag()}``. None: no effects, not even weight.
         boundaries: grasps and colliders by name, applied in order.
-        contact: discretisation of contact between layers. None: no contact. The parameters k, gamma and c_F of the
-            material then have no effect and require no gradients.
+        contact: discretisation of contact between layers. "auto": ``Contact()`` if at least a fifth of all pairs of
+            triangles can meet, else none, as on a coarse mesh; ``print(cloth)`` says which.
+            None: no contact. The parameters k, gamma and c_F of the material then have no effect and require no
+            gradients.
         engine: what computes the substeps. "auto": the fused engine (C++, CUDA C++; float32 or float64) if it knows
             all parts, else the torch reference, on CUDA in graphs; ``print(cloth)`` says which and why. "fused": raise
             an error if the engine cannot. "reference": always torch, on CUDA launched one by one. The attribute of the
@@ -102,7 +104,7 @@ class Cloth(nn.Module):
         areal_density: float | Tensor,
         effects: Mapping[str, AbstractEffect] | None = None,
         boundaries: Mapping[str, AbstractBoundary] | None = None,
-        contact: Contact | None = Contact(),  # noqa: B008 - frozen, carries no state
+        contact: Contact | Literal["auto"] | None = "auto",
         engine: Setting = "auto",
     ) -> None:
         super().__init__()
@@ -122,9 +124,8 @@ class Cloth(nn.Module):
         self.effects.update(effects)
         self.boundaries.update(boundaries)
         check_grasps(dict(self._named_effects()), self.boundaries)
-        self._contact, self._grid = contact, None if contact is None else contact.build_grid(mesh)
-        contact_warnings = () if self._grid is None else self._grid.contact_warnings(mesh)
-        for text in (*mesh_warnings(mesh, self.areal_density.value), *contact_warnings):
+        self._contact, self._grid, self._no_contact_reason = _resolve_contact(contact, mesh)
+        for text in (*mesh_warnings(mesh, self.areal_density.value), *self._contact_warnings()):
             warnings.warn(text, stacklevel=2)
         self._freeze_inert_parameters()
         self._store_geometry()
@@ -362,6 +363,12 @@ class Cloth(nn.Module):
 
     # -- parts of the above ---------------------------------------------------------------------------------------
 
+    def _contact_warnings(self) -> Iterable[str]:
+        if self._grid is None:
+            return ()
+        stiffness = self.material.stiffness(self.material.coefficients()).normal.detach()
+        return self._grid.contact_warnings(self.mesh, stiffness, self.areal_density.value.detach())
+
     def _freeze_inert_parameters(self) -> None:
         """Let parameters of contact require no gradients without it, as DistributedDataParallel waits for gradients."""
         if self._contact is None:
@@ -429,12 +436,24 @@ class Cloth(nn.Module):
         size = f"{len(self.mesh.vertices)} vertices, {len(self.mesh.faces)} triangles, {self.mesh.area.sum():.4g} m^2"
         if (pieces := self.mesh.piece_count) > 1:
             size += f", {pieces} pieces that nothing joins"
-        grid = "none" if self._grid is None else self._grid.summary
+        grid = f"none{self._no_contact_reason}" if self._grid is None else self._grid.summary
         try:
             step, engine = f"{self.stable_step():.3g} s", self.engine_in_use
         except TorchclothError as error:  # a cloth that cannot be simulated is printed to see why
             step, engine = str(error), "none"
         return f"{size}\ncontact: {grid}\nstable step: {step}\nengine: {engine}"
+
+
+def _resolve_contact(contact: Contact | Literal["auto"] | None, mesh: Mesh) -> tuple[Contact | None, Grid | None, str]:
+    """Return the contact to use, its grid, and why there is none although it was left to us."""
+    chosen = Contact() if contact == "auto" else contact
+    grid = None if chosen is None else chosen.build_grid(mesh)
+    if contact == "auto" and grid is not None and not grid.can_act:
+        reason = f", as the mesh is too coarse ({grid.summary}); contact=Contact.with_gap(...) asks for it"
+        if len(grid.find_layers(mesh)):
+            warnings.warn(f"contact: layers pass through each other{reason}", stacklevel=3)
+        return None, None, reason
+    return chosen, grid, ""
 
 
 def _warp_sign(is_from_behind: np.ndarray, dtype: torch.dtype) -> Tensor | None:

@@ -103,7 +103,14 @@ def test_everywhere():
 def folded(contact):
     """(a strip folded on itself whose upper half rolls along at a speed, its state)"""
     mesh = tc.meshes.rectangle(0.4, 0.05, resolution=(41, 6))
-    cloth = tc.Cloth(mesh, tc.materials.AEP(6e4, 0.3, 5e4, 3e4), 0.15, {"gravity": tc.effects.Gravity()}, {}, contact)
+    cloth = tc.Cloth(
+        mesh,
+        tc.materials.AEP(6e4, 0.3, contact_stiffness=5e4, shear_stiffness=3e4),
+        0.15,
+        {"gravity": tc.effects.Gravity()},
+        {},
+        contact,
+    )
     x = torch.as_tensor(mesh.vertices).clone()
     over = x[:, 0] > 0.2
     x[over, 0], x[over, 2] = 0.4 - x[over, 0], 1.3 * SPACING

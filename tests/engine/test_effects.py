@@ -99,7 +99,7 @@ def test_standard_in_a_hand():
 
 @pytest.mark.parametrize("options", [{}, {"weft_ratio": 0.5, "curl_weft": 3.0}])
 def test_creases_where_it_is_bent_far(options):
-    cloth = sheet({"crease": E.CreasingBending(1e-4, 30.0, yield_curvature=12.0, **options)})
+    cloth = sheet({"crease": E.CreasingBending(1e-4, mobility=30.0, yield_curvature=12.0, **options)})
     state = remembering(make_moving_state(cloth))
     with torch.no_grad():
         after, _ = substep.rollout(cloth.build_model(), state, 1e-4, {}, 1)
@@ -126,7 +126,7 @@ def test_all_together_in_a_batch():
     effects = {
         **standard(),
         "curl": E.Bending(1e-4 * batch, 0.01, weft_ratio=0.6 * batch, curl_warp=2.0),
-        "crease": E.CreasingBending(1e-4, 30.0 * batch, yield_curvature=12.0),
+        "crease": E.CreasingBending(1e-4, mobility=30.0 * batch, yield_curvature=12.0),
         "friction": E.BendingFriction(1e-3 * batch, threshold=3.0),
         "saturating": E.SaturatingBending(1e-3 * batch, 3.0),
         "shear": E.ShearFriction(5.0 * batch, threshold=0.02),

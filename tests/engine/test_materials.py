@@ -44,7 +44,9 @@ def test_isotropic(convention):
 
 
 def test_stiffening():
-    cloth = sheet(tc.materials.StiffeningAEP(field(5e4, 7e4), field(0.2, 0.4), field(0, 30), stiffening_reach=REACH))
+    cloth = sheet(
+        tc.materials.StiffeningAEP(field(5e4, 7e4), field(0.2, 0.4), stiffening=field(0, 30), stiffening_reach=REACH)
+    )
     check_agreement(cloth, {}, make_moving_state(cloth, strain=0.03))
 
 

@@ -49,7 +49,7 @@ def pressed():
     mesh = tc.meshes.rectangle(0.2, 0.2, resolution=(4, 4))
     cloth = tc.Cloth(
         mesh,
-        tc.materials.AEP(1e5, 0.3, 1e5, 5e4, cone=0.3),
+        tc.materials.AEP(1e5, 0.3, contact_stiffness=1e5, shear_stiffness=5e4, cone=0.3),
         0.2,
         contact=tc.Contact(everywhere=True, free_compression=0.1),
     )

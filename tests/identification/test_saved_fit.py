@@ -104,7 +104,7 @@ def leaning(cloth):
 
 
 def blown(cloth):
-    return AirDrag(1.2, cloth.effects["air"].density, wind=(0.3, 0.0, 0.0))
+    return AirDrag(1.2, density=cloth.effects["air"].density, wind=(0.3, 0.0, 0.0))
 
 
 @pytest.mark.parametrize(

@@ -12,7 +12,7 @@ from torchcloth.materials import AEP
 def random_cloth(convention="plane_stress", points=2, seed=0):
     torch.manual_seed(seed)
     mesh = tc.meshes.rectangle(0.2, 0.2, resolution=(4, 3))
-    material = AEP(1e5, 0.3, 4e5, 7e4, cone=0.4, convention=convention)
+    material = AEP(1e5, 0.3, contact_stiffness=4e5, shear_stiffness=7e4, cone=0.4, convention=convention)
     contact = tc.Contact(spacing=mesh.mean_edge, subdivisions=points, everywhere=True)
     return tc.Cloth(mesh, material, 0.2, contact=contact)
 
@@ -90,7 +90,7 @@ def test_energy_is_frame_indifferent():
 
 
 def test_return_map_is_idempotent_and_lands_on_the_cone():
-    material = AEP(1e5, 0.3, 4e5, 7e4, cone=0.4)
+    material = AEP(1e5, 0.3, contact_stiffness=4e5, shear_stiffness=7e4, cone=0.4)
     c = material.coefficients()
     torch.manual_seed(0)
     n = torch.nn.functional.normalize(torch.randn(500, 3), dim=-1)

@@ -30,7 +30,7 @@ def layers(height, *, upper=(0.04, 3), contact=None, cone=0.3, stiffness=STIFFNE
     vertices = np.concatenate([below.vertices, above.vertices @ turn.T + np.array([0.02, 0.03, height])])
     uv = np.concatenate([below.uv, above.uv + np.array([1.0, 0.0])])
     mesh = tc.meshes.Mesh.build(vertices, np.concatenate([below.faces, above.faces + count]), uv)
-    material = tc.materials.AEP(1e5, 0.3, 1e3 * stiffness, 1e3 * stiffness, cone=cone)
+    material = tc.materials.AEP(1e5, 0.3, contact_stiffness=1e3 * stiffness, shear_stiffness=1e3 * stiffness, cone=cone)
     effects = {"bending": tc.effects.Bending(1e-4, 0.005), **(effects or {})}
     contact = contact or tc.Contact(spacing=SPACING)
     return tc.Cloth(mesh, material, DENSITY, effects, {"pin": tc.boundaries.Grasp(range(count))}, contact), slice(
@@ -57,7 +57,7 @@ def test_a_sheet_alone_needs_no_grid():
     mesh = tc.meshes.rectangle(0.3, 0.3, resolution=(9, 9))
     runs = []
     for contact in (None, tc.Contact(spacing=0.02)):
-        parts = (mesh, tc.materials.AEP(1e5, 0.3, 1e4), DENSITY, {"gravity": tc.effects.Gravity()})
+        parts = (mesh, tc.materials.AEP(1e5, 0.3, contact_stiffness=1e4), DENSITY, {"gravity": tc.effects.Gravity()})
         cloth = tc.Cloth(*parts, contact=contact, engine="reference")
         x = torch.as_tensor(mesh.vertices).clone()
         x[:, 2] = 0.03 * torch.sin(20 * x[:, 0])
@@ -251,7 +251,7 @@ def test_large_cells_of_an_uneven_mesh_have_no_holes(cell):
         np.concatenate([np.stack([a, b, c], -1), np.stack([a, c, d], -1), upper.faces + count]),
         np.concatenate([below[:, :2], upper.uv + np.array([1.0, 0.0])]),
     )
-    material = tc.materials.AEP(1e5, 0.3, 1e3 * STIFFNESS, 1e3 * STIFFNESS)
+    material = tc.materials.AEP(1e5, 0.3, contact_stiffness=1e3 * STIFFNESS, shear_stiffness=1e3 * STIFFNESS)
     effects, pin = gravity() | {"damping": tc.effects.MassDamping(8.0)}, {"pin": tc.boundaries.Grasp(range(count))}
     cloth = tc.Cloth(mesh, material, DENSITY, effects, pin, tc.Contact(spacing=SPACING))
     with torch.no_grad():
@@ -265,11 +265,40 @@ def test_layers_that_do_not_meet_are_told(contact, reported):
     mesh = tc.meshes.shirt(triangles=2000 if not reported else 300)
     with warnings.catch_warnings(record=True) as said:
         warnings.simplefilter("always")
-        tc.Cloth(mesh, tc.materials.AEP(1e5, 0.3, 5e4), DENSITY, contact=contact)
+        tc.Cloth(mesh, tc.materials.AEP(1e5, 0.3, contact_stiffness=5e4), DENSITY, contact=contact)
         tc.Cloth(tc.meshes.rectangle(0.3, 0.3, resolution=(9, 9)), tc.materials.AEP(1e5), DENSITY)
     texts = [str(w.message) for w in said]
     assert len(texts) == reported
     assert all("lie over another layer do not see it" in text for text in texts)
+
+
+def test_layers_too_weak_to_carry_the_cloth_are_told():
+    """Reported: in AEP(5e4, 0.3, 1e-3) the third number was the contact stiffness, not the thickness."""
+    mesh, contact = tc.meshes.rectangle(0.3, 0.3, resolution=(9, 9)), tc.Contact(spacing=0.02)
+    with pytest.raises(TypeError, match="positional"):
+        tc.materials.AEP(5e4, 0.3, 1e-3)
+    with pytest.warns(UserWarning, match=r"k h of 1e-06 N/m cannot carry the cloth's weight of 1.96 Pa, .* 0.8\d N/m"):
+        tc.Cloth(mesh, tc.materials.AEP(5e4, contact_stiffness=1e-3), 0.2, contact=contact)
+    tc.Cloth(mesh, tc.materials.AEP(5e4, contact_stiffness=1e3), 0.2, contact=contact)
+    tc.Cloth(mesh, tc.materials.AEP(5e4, contact_stiffness=1e-3), 0.2, contact=None)
+
+
+@pytest.mark.parametrize(("triangles", "acts"), [(200, False), (450, True)])
+def test_contact_that_cannot_act_is_off_by_default(triangles, acts):
+    """Reported: on 200 triangles layers would have rested 47.8 mm apart, for a step 3.2 times shorter."""
+    mesh, material = tc.meshes.rectangle(0.3, 0.3, triangles=triangles), tc.materials.AEP(1e5)
+    cloth, without, asked = (
+        tc.Cloth(mesh, material, 0.2, **c) for c in ({}, {"contact": None}, {"contact": tc.Contact()})
+    )
+    assert (cloth.contact == tc.Contact()) is acts
+    assert cloth.stable_step() == (asked if acts else without).stable_step()
+    assert asked.stable_step() < 0.5 * without.stable_step()
+    assert ("contact: none, as the mesh is too coarse (layers rest 47.8 mm apart" in str(cloth)) is not acts
+
+
+def test_a_garment_too_coarse_for_contact_is_told():
+    with pytest.warns(UserWarning, match=r"layers pass through each other, as the mesh is too coarse .*with_gap"):
+        tc.Cloth(tc.meshes.shirt(triangles=300), tc.materials.AEP(1e5), 0.2)
 
 
 def test_contact_that_costs_a_hundred_times_as_much_is_told():

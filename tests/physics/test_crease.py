@@ -20,7 +20,7 @@ YIELD, MOBILITY = 5.0, 20.0
 
 
 def sheet(mesh, **options):
-    return tc.effects.CreasingBending(1e-3, MOBILITY, YIELD, **options).bind(mesh)
+    return tc.effects.CreasingBending(1e-3, mobility=MOBILITY, yield_curvature=YIELD, **options).bind(mesh)
 
 
 @pytest.mark.parametrize("degrees", [0, 30, 90])
@@ -52,7 +52,7 @@ def test_a_strip_that_was_folded_and_let_go_keeps_its_angle(curl):
     columns, length = 13, 0.12
     mesh = tc.meshes.rectangle(length, 0.02, resolution=(columns, 3))
     effects = {
-        "bending": tc.effects.CreasingBending(1e-3, mobility, YIELD, curl_warp=curl),
+        "bending": tc.effects.CreasingBending(1e-3, mobility=mobility, yield_curvature=YIELD, curl_warp=curl),
         "damping": tc.effects.MassDamping(150.0),
     }
     everywhere = tc.boundaries.Grasp(range(len(mesh.vertices)))
@@ -82,7 +82,9 @@ def test_force_is_that_of_the_energy_from_the_creased_shape():
 
 
 def test_momentum_and_angular_momentum_are_kept():
-    linear, angular = measure_momentum_drift({"bending": tc.effects.CreasingBending(1e-3, 100.0, 0.5)})
+    linear, angular = measure_momentum_drift(
+        {"bending": tc.effects.CreasingBending(1e-3, mobility=100.0, yield_curvature=0.5)}
+    )
     assert linear < 1e-9
     assert angular < 1e-9
 
@@ -90,7 +92,7 @@ def test_momentum_and_angular_momentum_are_kept():
 def test_gradients_through_the_crease():
     """Of the shape after flow, in the start, the mobility and the stiffness."""
     mesh = tc.meshes.rectangle(0.08, 0.04, resolution=(5, 3))
-    effects = {"bending": tc.effects.CreasingBending(1e-3, 50.0, 1.0, curl_warp=1.0)}
+    effects = {"bending": tc.effects.CreasingBending(1e-3, mobility=50.0, yield_curvature=1.0, curl_warp=1.0)}
     cloth = tc.Cloth(mesh, tc.materials.AEP(200.0, 0.2), 0.2, effects, contact=None)
     state = cloth.state(roll_to_cylinder(mesh, 8.0, 20))
     times = (0.0, 14 * cloth.stable_step())

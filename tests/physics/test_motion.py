@@ -11,7 +11,7 @@ from torchcloth.boundaries.motion import interpolate_poses, sample_trajectory
 
 def sheet(size=0.3, n=8, *, effects=None, boundaries=None, contact=tc.Contact(), Y=300.0, density=0.15):  # noqa: B008
     mesh = tc.meshes.rectangle(size, size, resolution=(n, n))
-    material = tc.materials.AEP(Y * 1e3, 0.3, 1e6, 2e5)
+    material = tc.materials.AEP(Y * 1e3, 0.3, contact_stiffness=1e6, shear_stiffness=2e5)
     return tc.Cloth(mesh, material, density, effects=effects, boundaries=boundaries, contact=contact)
 
 

@@ -57,7 +57,7 @@ def test_air_that_goes_with_it_slows_it(depth):
 def test_drag_takes_of_the_amplitude_by_its_square():
     """theta'' + w^2 theta + k theta'|theta'| = 0 with k = 3 rho C L / (8 rho_A): A' = -(4 / 3 pi) k w A^2."""
     drag = 1.2
-    free, air = (turns(*swing(effects, 2.6)) for effects in ({}, {"air": tc.effects.AirDrag(drag, RHO)}))
+    free, air = (turns(*swing(effects, 2.6)) for effects in ({}, {"air": tc.effects.AirDrag(drag, density=RHO)}))
     k = 3 * RHO * drag * LENGTH / (8 * DENSITY)
     rate = 4 / (3 * math.pi) * k * 2 * math.pi / period()
     # by the slope of 1 / A, less what the scheme takes without air

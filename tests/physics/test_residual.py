@@ -49,7 +49,10 @@ def moving(cloth):
 @pytest.mark.parametrize(
     ("terms", "known"),
     [
-        ({"across2": 0.5 * 1.204 * 1.3, "along2": 0.5 * 1.204 * 0.1}, lambda: AirDrag(1.3, 1.204, 0.1)),
+        (
+            {"across2": 0.5 * 1.204 * 1.3, "along2": 0.5 * 1.204 * 0.1},
+            lambda: AirDrag(1.3, density=1.204, tangential=0.1),
+        ),
         ({"strain_rate": 0.7}, lambda: KelvinVoigt(0.7)),
     ],
 )

@@ -32,8 +32,18 @@ def test_tension_along_a_yarn(angle, stiffness, c):
 
 def test_one_modulus_is_both_yarns():
     even, both = (
-        StiffeningAEP(60 / H, 0.3, 2.0),
-        OrthotropicAEP(60 / H, 60 / H, 60 / 2.6 / H, 0.3, 1e6, 2.5e5, 0.3, 2.0, 2.0),
+        StiffeningAEP(60 / H, 0.3, stiffening=2.0),
+        OrthotropicAEP(
+            60 / H,
+            60 / H,
+            60 / 2.6 / H,
+            0.3,
+            contact_stiffness=1e6,
+            shear_stiffness=2.5e5,
+            cone=0.3,
+            warp_stiffening=2.0,
+            weft_stiffening=2.0,
+        ),
     )
     for one, other in zip(even.coefficients(), both.coefficients(), strict=True):
         torch.testing.assert_close(one, other, rtol=1e-12, atol=1e-12)

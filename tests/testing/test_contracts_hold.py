@@ -18,49 +18,56 @@ from torchcloth.testing import (
 
 class TestAEP(MaterialContract):
     def make(self):
-        return tc.materials.AEP(1e5, 0.3, 4e5, 7e4, cone=0.4)
+        return tc.materials.AEP(1e5, 0.3, contact_stiffness=4e5, shear_stiffness=7e4, cone=0.4)
 
 
 class TestAEPInThePapersConvention(MaterialContract):
     def make(self):
-        return tc.materials.AEP(1e5, 0.3, 4e5, 7e4, cone=0.4, convention="paper")
+        return tc.materials.AEP(1e5, 0.3, contact_stiffness=4e5, shear_stiffness=7e4, cone=0.4, convention="paper")
 
 
 class TestAEPWithFields(MaterialContract):
     def make(self):
         field = torch.linspace(0.8, 1.2, self.triangles)
-        return tc.materials.AEP(1e5 * field, 0.3 * field, 4e5 / field, 7e4 * field, cone=0.4 / field)
+        return tc.materials.AEP(
+            1e5 * field, 0.3 * field, contact_stiffness=4e5 / field, shear_stiffness=7e4 * field, cone=0.4 / field
+        )
 
 
 class TestOrthotropicAEP(MaterialContract):
     def make(self):
-        return tc.materials.OrthotropicAEP(1e5, 3e4, 2e3, 0.3, 4e5, 7e4, cone=0.4)
+        return tc.materials.OrthotropicAEP(1e5, 3e4, 2e3, 0.3, contact_stiffness=4e5, shear_stiffness=7e4, cone=0.4)
 
 
 class TestStiffeningAEP(MaterialContract):
     def make(self):
-        return tc.materials.StiffeningAEP(1e5, 0.3, 8.0, 4e5, 7e4, cone=0.4)
+        return tc.materials.StiffeningAEP(
+            1e5, 0.3, stiffening=8.0, contact_stiffness=4e5, shear_stiffness=7e4, cone=0.4
+        )
 
 
 class TestStiffeningOrthotropicAEPWithFields(MaterialContract):
     def make(self):
         field = torch.linspace(0.8, 1.2, self.triangles)
-        moduli = (1e5 * field, 3e6 / field, 2e3 * field, 0.3 * field, 4e5 / field, 7e4 * field)
-        return tc.materials.OrthotropicAEP(
-            *moduli, cone=0.4 / field, warp_stiffening=30 * field, weft_stiffening=10 / field
-        )
+        moduli = (1e5 * field, 3e6 / field, 2e3 * field, 0.3 * field)
+        director = {"contact_stiffness": 4e5 / field, "shear_stiffness": 7e4 * field, "cone": 0.4 / field}
+        return tc.materials.OrthotropicAEP(*moduli, **director, warp_stiffening=30 * field, weft_stiffening=10 / field)
 
 
 class TestPlasticAEP(MaterialContract):
     def make(self):
-        return tc.materials.AEP(1e5, 0.3, 4e5, 7e4, cone=0.4, plastic=tc.materials.NormYield(0.02))
+        return tc.materials.AEP(
+            1e5, 0.3, contact_stiffness=4e5, shear_stiffness=7e4, cone=0.4, plastic=tc.materials.NormYield(0.02)
+        )
 
 
 class TestPlasticOrthotropicAEPWithFields(MaterialContract):
     def make(self):
         limit = torch.linspace(0.02, 0.04, self.triangles)
         plastic = tc.materials.NormYield(limit)
-        return tc.materials.OrthotropicAEP(1e5, 3e4, 2e3, 0.3, 4e5, 7e4, cone=0.4, plastic=plastic)
+        return tc.materials.OrthotropicAEP(
+            1e5, 3e4, 2e3, 0.3, contact_stiffness=4e5, shear_stiffness=7e4, cone=0.4, plastic=plastic
+        )
 
 
 class TestCottonPreset(MaterialContract):
@@ -113,7 +120,7 @@ class TestBending(EffectContract):
 class TestWovenBending(EffectContract):
     def make(self, amplitude):
         curls = {"curl_warp": 3.0, "curl_weft": -1.0}
-        return tc.effects.Bending(amplitude, 0.01, 0.3, weft_ratio=0.5, twist_ratio=0.7, **curls)
+        return tc.effects.Bending(amplitude, 0.01, poisson=0.3, weft_ratio=0.5, twist_ratio=0.7, **curls)
 
 
 class TestBendingField(EffectContract):
@@ -165,7 +172,7 @@ class TestShearFriction(EffectContract):
 
 class TestCreasingBending(EffectContract):
     def make(self, amplitude):
-        return tc.effects.CreasingBending(1e-3, amplitude, yield_curvature=0.2, weft_ratio=0.5, curl_warp=1.0)
+        return tc.effects.CreasingBending(1e-3, mobility=amplitude, yield_curvature=0.2, weft_ratio=0.5, curl_warp=1.0)
 
     def base(self):
         return {"bending": tc.effects.Bending(1e-3, weft_ratio=0.5, curl_warp=1.0)}

@@ -11,7 +11,7 @@ from torchcloth.testing import BoundaryContract, ColliderContract, EffectContrac
 def material_contract(law):
     class Contract(MaterialContract):
         def make(self):
-            return law(1e5, 0.3, 4e5, 7e4, cone=0.4)
+            return law(1e5, 0.3, contact_stiffness=4e5, shear_stiffness=7e4, cone=0.4)
 
     return Contract()
 

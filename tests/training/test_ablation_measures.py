@@ -69,7 +69,7 @@ def test_a_small_shift_counts_twice():
 def test_energy_without_each_parameter():
     """A sheet under uniform stretch (a, b), its directors compressed to R33 and sheared by r: closed form."""
     youngs, nu, k, gamma, play = 300e3, 0.12, 5e6, 4e5, 0.25
-    material = AEP(youngs, nu, k, gamma, convention="paper")
+    material = AEP(youngs, nu, contact_stiffness=k, shear_stiffness=gamma, convention="paper")
     cloth = tc.Cloth(
         tc.meshes.rectangle(0.3, 0.2, triangles=24), material, 0.2, contact=Contact(0.08, free_compression=play)
     )

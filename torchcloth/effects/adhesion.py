@@ -56,6 +56,7 @@ class Adhesion(AbstractEffect):
         self,
         stress: float | Tensor = 1.5,
         gap: float = 1e-3,
+        *,
         point: Sequence[float] = (0.0, 0.0, 0.0),
         normal: Sequence[float] = (0.0, 0.0, 1.0),
     ) -> None:

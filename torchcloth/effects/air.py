@@ -87,6 +87,7 @@ class AirDrag(AbstractEffect):
     def __init__(
         self,
         normal: float | Tensor = 1.2,
+        *,
         density: float = STANDARD_AIR_DENSITY_KG_PER_M3,
         tangential: float | Tensor = 0.0,
         wind: Sequence[float] = (0.0, 0.0, 0.0),

@@ -50,6 +50,7 @@ class CreasingBending(Bending):
     def __init__(
         self,
         stiffness: float | Tensor = 1e-5,
+        *,
         mobility: float | Tensor = 1.0,
         yield_curvature: float = 100.0,
         **options: Any,

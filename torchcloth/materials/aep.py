@@ -64,6 +64,7 @@ class AEP(DirectorMaterial):
         self,
         youngs_modulus: float | Tensor,
         poisson_ratio: float | Tensor = 0.3,
+        *,
         contact_stiffness: float | Tensor = 1e6,
         shear_stiffness: float | Tensor = 2.5e5,
         cone: float | Tensor = 0.3,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
+from typing import Literal
 
 import numpy as np
 import torch
@@ -32,7 +33,7 @@ def check_parts(
     material: AbstractMaterial,
     effects: Mapping[str, AbstractEffect],
     boundaries: Mapping[str, AbstractBoundary],
-    contact: Contact | None,
+    contact: Contact | Literal["auto"] | None,
 ) -> None:
     """Check that each part of a cloth is of its kind.
 
@@ -45,8 +46,8 @@ def check_parts(
         _check_kind(what, parts, (Mapping, nn.ModuleDict), f"a dict of names and {what}")
         for name, part in parts.items():
             check_part(what, name, part)
-    if contact is not None:
-        _check_kind("contact", contact, Contact, "Contact(...) or None")
+    if contact is not None and contact != "auto":
+        _check_kind("contact", contact, Contact, 'Contact(...), "auto" or None')
 
 
 def is_name(name: object) -> bool:

@@ -166,7 +166,11 @@ def build_sheet(
         "air": tc.effects.AirDrag(PLATE_DRAG_COEFFICIENT),
     }
     material = tc.materials.AEP(
-        fabric.membrane / THICKNESS_M, fabric.poisson, contact_stiffness, shear_stiffness, thickness=THICKNESS_M
+        fabric.membrane / THICKNESS_M,
+        fabric.poisson,
+        contact_stiffness=contact_stiffness,
+        shear_stiffness=shear_stiffness,
+        thickness=THICKNESS_M,
     )
     return build_cloth(recording, material, effects, contact)
 

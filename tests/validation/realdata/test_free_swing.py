@@ -81,7 +81,7 @@ class HangingStrips:
                 "gravity": tc.effects.Gravity((0.0, -STANDARD_GRAVITY_M_PER_S2, 0.0)),
                 "drag": tc.effects.AirDrag(
                     per_scene([a.drag * NOMINAL_DENSITY_KG_PER_M2 / STANDARD_AIR_DENSITY_KG_PER_M3 for a in airs]),
-                    STANDARD_AIR_DENSITY_KG_PER_M3,
+                    density=STANDARD_AIR_DENSITY_KG_PER_M3,
                 ),
                 "added": tc.effects.AddedMass(
                     per_scene([a.mass * NOMINAL_DENSITY_KG_PER_M2 / STANDARD_AIR_DENSITY_KG_PER_M3 for a in airs]),

@@ -165,7 +165,7 @@ def test_identify_finds_the_air_that_moves_along(recording):
     """
     effects = {
         "gravity": tc.effects.Gravity(),
-        "air": tc.effects.AirDrag(1.2, STANDARD_AIR_DENSITY_KG_PER_M3),
+        "air": tc.effects.AirDrag(1.2, density=STANDARD_AIR_DENSITY_KG_PER_M3),
         "bending": tc.effects.Bending(IRI_BENDING_N_M, IRI_DAMPING_TIME_S),
         "added": tc.effects.AddedMass(0.1, STANDARD_AIR_DENSITY_KG_PER_M3),
     }

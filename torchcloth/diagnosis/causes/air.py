@@ -22,7 +22,9 @@ def _drag(world: World) -> tuple[float, float, list[float], float]:
 
 def _add_drag(world: World, normal: float = 0.0, tangential: float = 0.0) -> World:
     n, t, wind, density = _drag(world)
-    return world.with_cloth({DRAG_EFFECT_NAME: AirDrag(n + normal, density, t + tangential, wind)})
+    return world.with_cloth(
+        {DRAG_EFFECT_NAME: AirDrag(n + normal, density=density, tangential=t + tangential, wind=wind)}
+    )
 
 
 def _add_wind(axis: int, world: World, speed: float) -> World:
@@ -30,7 +32,7 @@ def _add_wind(axis: int, world: World, speed: float) -> World:
     n, t, wind, density = _drag(world)
     wind[axis] += speed
     normal = n if DRAG_EFFECT_NAME in dict(world.cloth.effects.items()) else AirDrag.amplitudes["normal"].typical
-    return world.with_cloth({DRAG_EFFECT_NAME: AirDrag(normal, density, t, wind)})
+    return world.with_cloth({DRAG_EFFECT_NAME: AirDrag(normal, density=density, tangential=t, wind=wind)})
 
 
 def _add_viscosity(world: World, time: float) -> World:

@@ -81,7 +81,7 @@ def _friction_axis(plane: Plane) -> list[float]:
 def _add_adhesion(world: World, stress: float) -> World:
     tables = {name: part for name, part in world.cloth.boundaries.items() if isinstance(part, Plane)}
     pulls = {
-        f"{name}_pull": Adhesion(stress, ADHESION_RANGE_M, t.point.tolist(), t.normal.tolist())
+        f"{name}_pull": Adhesion(stress, ADHESION_RANGE_M, point=t.point.tolist(), normal=t.normal.tolist())
         for name, t in tables.items()
     }
     return world.with_cloth(pulls)

@@ -11,6 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from ..._utils.constants import STANDARD_GRAVITY_M_PER_S2
 from ...errors import InvalidInput
 from ...meshes import Mesh
 from .neighbours import find_non_adjacent_triangles, find_overlapping_triangles
@@ -26,6 +27,7 @@ MAX_POINT_DISTANCE_SPACINGS = 1.4  # between corners of sub-triangles: no hole b
 WRAP_EXTENT_FACTOR = 1.6
 MAX_POINTS_PER_EDGE = 100  # that is 10 000 points in a triangle
 WARN_POINTS_PER_TRIANGLE = 64  # usual are 1 to 4
+MIN_MEETING_PAIR_FRACTION = 0.2  # of all pairs of triangles, those that can meet, for contact that is on by default
 WARN_UNSEEN_LAYER_FRACTION = 0.5  # of the triangles in layers, those that do not see the other layer
 FOLD_PATH_RATIO = 1.7  # layers are folded on each other where the path along the cloth is so much longer than in space
 
@@ -61,6 +63,20 @@ class Grid(NamedTuple):
         return (self.nodes - 4) * self.spacing
 
     @property
+    def can_act(self) -> bool:
+        """Whether at least a fifth of all pairs of triangles are no neighbours, so that layers can meet."""
+        return self.non_adjacent is None or float(self.non_adjacent.double().mean()) >= MIN_MEETING_PAIR_FRACTION
+
+    @property
+    def _largest_compression(self) -> float:
+        """Compression 1 - R33 that presses where two layers lie in one place."""
+        return COMPRESSION_ONSET_SPACINGS / APPROACH_PER_COMPRESSION_SPACINGS - self.free_compression
+
+    def find_layers(self, mesh: Mesh) -> np.ndarray:
+        """Return pairs of triangles [N, 2] that lie over each other, within two gaps."""
+        return find_overlapping_triangles(mesh, 2 * REST_GAP_SPACINGS * self.spacing)
+
+    @property
     def summary(self) -> str:
         """Description for the data sheet of a cloth: gap between layers, and points per triangle."""
         gap, unseen = 1e3 * REST_GAP_SPACINGS * self.spacing, 1e3 * FOLD_PATH_RATIO * self.reach
@@ -69,15 +85,29 @@ class Grid(NamedTuple):
             f"{len(self.points)} point(s) per triangle"
         )
 
-    def contact_warnings(self, mesh: Mesh) -> Iterator[str]:
-        """Yield warnings about the cost of contact, and about layers that lie over each other but do not interact."""
+    def contact_warnings(self, mesh: Mesh, stiffness: Tensor, areal_density: Tensor) -> Iterator[str]:
+        """Yield warnings about contact that is weak or costly, or that layers over each other do not have.
+
+        Args:
+            mesh: of the cloth.
+            stiffness: k h [N/m], of any shape.
+            areal_density: [kg/m^2], of any shape.
+        """
+        weakest, weight = float(stiffness.min()), STANDARD_GRAVITY_M_PER_S2 * float(areal_density.max())
+        needed = weight * APPROACH_PER_COMPRESSION_SPACINGS * self.spacing / self._largest_compression**2
+        if weakest < needed:
+            yield (
+                f"contact: a stiffness k h of {weakest:.3g} N/m cannot carry the cloth's weight of {weight:.3g} Pa, so "
+                f"layers pass through each other; that takes {needed:.2g} N/m or more (contact_stiffness times "
+                "thickness)"
+            )
         if len(self.points) >= WARN_POINTS_PER_TRIANGLE:
             yield (
                 f"contact: edges of some {1e3 * mesh.coarse_edge:.3g} mm take {len(self.points)} points in each "
                 f"triangle near another layer, and each costs as much as a triangle ({self.summary}): give the mesh "
                 "more triangles, or contact=Contact.with_gap(...) a larger gap"
             )
-        pairs = find_overlapping_triangles(mesh, 2 * REST_GAP_SPACINGS * self.spacing)
+        pairs = self.find_layers(mesh)
         if self.non_adjacent is None or not len(pairs):
             return
         is_seen = self.non_adjacent.cpu().numpy()[pairs[:, 0], pairs[:, 1]]

@@ -168,7 +168,7 @@ class Scene:
     def cloth(self, fabric: Fabric) -> tc.Cloth:
         """Build the garment with these values."""
         h = cloth_properties(self.garment.fabric)["thickness"]
-        law = AEP(*fabric[:2], contact_stiffness=fabric[2], shear_stiffness=fabric[3], thickness=h)
+        law = AEP(fabric[0], fabric[1], contact_stiffness=fabric[2], shear_stiffness=fabric[3], thickness=h)
         effects = {
             "gravity": Gravity(),
             "air": AirDrag(fabric.air),

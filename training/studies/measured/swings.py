@@ -77,7 +77,7 @@ def cloth_of(run: recordings.Recording, values: dict[str, float]) -> Cloth:
     """Build the hanging cloth in air with these values."""
     parts = {
         "gravity": effects.Gravity(),
-        "air": effects.AirDrag(values["air.normal"], STANDARD_AIR_DENSITY_KG_PER_M3),
+        "air": effects.AirDrag(values["air.normal"], density=STANDARD_AIR_DENSITY_KG_PER_M3),
         "added": effects.AddedMass(values["added.length"], STANDARD_AIR_DENSITY_KG_PER_M3),
         "damping": effects.MassDamping(values["damping.rate"]),
         "bending": effects.Bending(swings.IRI_BENDING_N_M, swings.IRI_DAMPING_TIME_S),

@@ -26,10 +26,10 @@ def make_material(cone: float = 0.3) -> tc.materials.AEP:
     return tc.materials.AEP(
         LAYER_STIFFNESS_N_PER_M / LAYER_THICKNESS_M,
         0.3,
-        CONTACT_STIFFNESS_N_PER_M / LAYER_THICKNESS_M,
-        SHEAR_STIFFNESS_N_PER_M / LAYER_THICKNESS_M,
-        cone,
-        LAYER_THICKNESS_M,
+        contact_stiffness=CONTACT_STIFFNESS_N_PER_M / LAYER_THICKNESS_M,
+        shear_stiffness=SHEAR_STIFFNESS_N_PER_M / LAYER_THICKNESS_M,
+        cone=cone,
+        thickness=LAYER_THICKNESS_M,
     )
 
 

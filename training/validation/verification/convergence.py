@@ -84,7 +84,7 @@ class Swing:
         }
         return self.cloth_type(
             tc.meshes.rectangle(SWING_SIDE_M, SWING_SIDE_M, resolution=(self.n, self.n)),
-            tc.materials.AEP(6.09e5, 0.3, self.contact_stiffness, 2.5e4),
+            tc.materials.AEP(6.09e5, 0.3, contact_stiffness=self.contact_stiffness, shear_stiffness=2.5e4),
             0.15,
             effects,
             corners,

@@ -159,7 +159,7 @@ def simulate_swing(rows: int, contact: tc.Contact | None, end: float) -> tuple[n
     s = mesh.vertices[:, 0]
     cloth = tc.Cloth(
         mesh,
-        tc.materials.AEP(6e5, 0.3, 1e5, 2e4),
+        tc.materials.AEP(6e5, 0.3, contact_stiffness=1e5, shear_stiffness=2e4),
         0.15,
         {"gravity": tc.effects.Gravity((STANDARD_GRAVITY_M_PER_S2, 0.0, 0.0))},
         {"clamp": tc.boundaries.Grasp(indices_where(s < 1e-9))},

@@ -49,7 +49,7 @@ def make_towel() -> tc.Cloth:
     grasps = {name: tc.boundaries.Grasp(indices_where(edge)) for name, edge in edges.items()}
     return tc.Cloth(
         mesh,
-        tc.materials.AEP(3e5, 0.3, 6e4, 2e4, 0.3, 1e-3),
+        tc.materials.AEP(3e5, 0.3, contact_stiffness=6e4, shear_stiffness=2e4, cone=0.3, thickness=1e-3),
         0.2,
         {"gravity": tc.effects.Gravity(), "air": tc.effects.AirDrag(1.2), "bending": tc.effects.Bending(1e-5, 0.01)},
         grasps | {"table": tc.boundaries.Plane(friction=0.6)},

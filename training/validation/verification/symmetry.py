@@ -23,7 +23,9 @@ CONSERVATION_TOLERANCE = absolute(1e-9)
 def make_free_sheet(n: int, contact: tc.Contact | None, effects=None, boundaries=None) -> tc.Cloth:
     """Return a sheet of 0.3 m x 0.3 m and n x n vertices, Y = 300 N/m, 0.15 kg/m^2."""
     mesh = tc.meshes.rectangle(0.3, 0.3, resolution=(n, n))
-    return tc.Cloth(mesh, tc.materials.AEP(3e5, 0.3, 1e5, 2e4), 0.15, effects, boundaries, contact)
+    return tc.Cloth(
+        mesh, tc.materials.AEP(3e5, 0.3, contact_stiffness=1e5, shear_stiffness=2e4), 0.15, effects, boundaries, contact
+    )
 
 
 def random_motion(cloth: tc.Cloth, speed: float) -> tc.ClothState:
