@@ -11,11 +11,13 @@ from helpers.twins import build_cloth_at, shift_clock
 
 import torchcloth as tc
 from torchcloth import recordings as rec
+from torchcloth.diagnosis.data.dataset import prepare_data
+from torchcloth.diagnosis.models.base_model import build_base_model
 from torchcloth.episodes import streams
-from torchcloth.episodes.observed import build_mesh, compute_initial_vertices, find_depth_camera
+from torchcloth.episodes.observed import build_mesh, check_recordings, compute_initial_vertices, find_depth_camera
 from torchcloth.episodes.unknowns import collect_unknowns, find_scalar_parameters
 from torchcloth.errors import InvalidInput, RecordingError
-from torchcloth.identification import build_cloth, build_episode, identify
+from torchcloth.identification import build_cloth, build_episode, fit_fields, identify
 from torchcloth.identification.estimators.objective import Objective
 from torchcloth.identification.uncertainty.richardson import refine_cloth, refine_recording
 
@@ -150,6 +152,23 @@ def test_an_episode_in_which_nothing_is_held_says_so(recording, model):
     open_ = {name: replace(g, closed=np.zeros_like(g.closed)) for name, g in recording.grippers.items()}
     (doubt,) = build_episode(model, replace(recording, grippers=open_)).data_warnings()
     assert "no gripper is ever closed" in doubt
+
+
+def test_a_fit_needs_something_that_holds_the_cloth(recording, model):
+    """Reported: with a gripper that is never closed, falling cloth was fitted for minutes."""
+    open_ = {name: replace(g, closed=np.zeros_like(g.closed)) for name, g in recording.grippers.items()}
+    falling = replace(recording, grippers=open_)
+    words = r"nothing holds the cloth; got grippers that are never closed \(.*\), and no collider; .* write closed"
+    for fit in (
+        lambda: identify(model, falling, ["youngs_modulus"]),
+        lambda: fit_fields(model, falling, ["youngs_modulus"]),
+        lambda: prepare_data(build_base_model(falling), [falling]),
+    ):
+        with pytest.raises(RecordingError, match=words):
+            fit()
+    table = rec.Collider(point=np.zeros(3), normal=np.array([0.0, 0.0, 1.0]))
+    assert check_recordings(replace(falling, colliders={"table": table}))
+    assert check_recordings(recording)
 
 
 def test_a_cloud_beside_the_cloth_says_so(recording, model):

@@ -200,7 +200,11 @@ def test_warnings_of_episodes_are_reported(config, episodes, tmp_path, capsys):
     seen = rec.read(episodes / "ep_0")
     open_ = {name: replace(hand, closed=np.zeros_like(hand.closed)) for name, hand in seen.grippers.items()}
     rec.write(replace(seen, grippers=open_), tmp_path / "open")
-    assert main(["--config", config(optimizer={"steps": 1}), f"data.train={tmp_path / 'open'}"]) == 0
+    capsys.readouterr()
+    assert main(["--config", config(), f"data.train={tmp_path / 'open'}"]) == 2
+    assert "open: nothing holds the cloth; got grippers that are never closed" in capsys.readouterr().err
+    sets = f"data.train={episodes / 'ep_1'}", f"data.val={tmp_path / 'open'}"  # a prediction may be of cloth let go
+    assert main(["--config", config(optimizer={"steps": 1}), *sets]) == 0
     assert "open: no gripper is ever closed" in json.loads((tmp_path / "out" / "fit.json").read_text())["warnings"][0]
     assert "warning: open: no gripper is ever closed" in capsys.readouterr().out
 

@@ -203,7 +203,7 @@ def check_recordings(recordings: Recording | Sequence[Recording]) -> list[Record
 
     Raises:
         InvalidInput: none, one twice, different cloths or tables, or something that is no recording.
-        RecordingError: one that is in another unit than metres.
+        RecordingError: one that is in another unit than metres, or in which nothing holds the cloth.
     """
     checked = as_list(recordings)
     if not checked:
@@ -212,8 +212,26 @@ def check_recordings(recordings: Recording | Sequence[Recording]) -> list[Record
     reject_duplicates(checked)
     for recording in checked:
         check_size(recording)
+        check_is_held(recording)
     merge_scene(checked)  # tables that contradict each other are refused now, and not with the result
     return checked
+
+
+def check_is_held(recording: Recording) -> None:
+    """Check that something holds the cloth, for a fit: cloth that falls freely tells of little but the air.
+
+    Raises:
+        RecordingError: no gripper is ever closed, and there is no collider.
+    """
+    if recording.colliders or list_closing_grippers(recording):
+        return
+    names = ", ".join([*recording.grippers, *recording.joints]) or "none"
+    raise RecordingError(
+        f"{recording.path}: nothing holds the cloth",
+        got=f"grippers that are never closed ({names}), and no collider",
+        expected="a gripper that closes, or a collider on which the cloth lies",
+        remedy="write closed (or width) in motion.npz: it is true while the gripper holds the cloth",
+    )
 
 
 def build_cloth(

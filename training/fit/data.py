@@ -12,6 +12,7 @@ import torch
 from torch.utils.data import DataLoader, Sampler
 
 from torchcloth import Cloth, recordings
+from torchcloth.episodes.observed import check_is_held
 from torchcloth.errors import InvalidInput
 from torchcloth.identification import Episode, build_episode
 from torchcloth.recordings import Recording
@@ -29,7 +30,8 @@ def read_episodes(data: Data) -> tuple[list[Recording], list[Recording]]:
     Raises:
         InvalidInput: a pattern matches nothing, there is nothing to train with, an episode is in both sets, or the
             episodes show different cloths.
-        RecordingError: an episode is inconsistent, or is not in metres.
+        RecordingError: an episode is inconsistent, is not in metres, or is to be trained with although nothing holds
+            the cloth.
     """
     folders = _folders(data.train, "data.train"), _folders(data.val, "data.val")
     if shared := folders[0].keys() & folders[1].keys():
@@ -47,6 +49,8 @@ def read_episodes(data: Data) -> tuple[list[Recording], list[Recording]]:
         raise InvalidInput("config: data.train", got="no episodes", expected="one or more to train with")
     for recording in (*train, *val):
         check_size(recording)
+    for recording in train:
+        check_is_held(recording)
     first = describe_cloth(train[0])
     for other in (*train[1:], *val):
         if not same_cloth(first, describe_cloth(other)):

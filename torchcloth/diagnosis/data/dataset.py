@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from ..._utils.caching import LRUCache, bytes_of
-from ...episodes.observed import Episode, build_episode
+from ...episodes.observed import Episode, build_episode, check_is_held
 from ...episodes.observed_surface import ObservedSurface, build_surface
 from ...episodes.replay import Frames
 from ...episodes.world import MAX_CLOCK_DELAY_S, World, WorldModel
@@ -98,6 +98,7 @@ def prepare_data(model: WorldModel, recordings: Sequence[Recording]) -> Diagnosi
 
     Raises:
         InvalidInput: an episode in which nothing is observed, or one that is too long.
+        RecordingError: an episode in which nothing holds the cloth.
     """
     return replace(_prepare(model, recordings), fine_mesh=_prepare(*refine_model(model, recordings)))
 
@@ -106,6 +107,7 @@ def _prepare(model: WorldModel, recordings: Sequence[Recording]) -> DiagnosisDat
     cloth = model.base.cloth
     episodes = []
     for recording in recordings:
+        check_is_held(recording)
         episode = extend_for_clock(_subsample(build_episode(cloth, recording)))
         _check_informative(episode)
         episodes.append(episode)
