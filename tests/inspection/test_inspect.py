@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from helpers.swinging_cloth import gripper_path, make_clouds, make_episode, make_markers, make_motion, node_pattern
+from PIL import Image
 
 from torchcloth import meshes
 from torchcloth import recordings as rec
@@ -184,6 +185,50 @@ def test_clouds_outliers_crop_area_and_strangers(needs_open3d):
     assert uncropped.crop_planes == {}
     assert np.median(uncropped.coverage) == pytest.approx(1.0, abs=0.1)
     assert np.median(result.coverage) < 0.85 * np.median(uncropped.coverage)  # 0.5 m - 0.3 m of the 0.3 m are left
+
+
+def test_frames_that_lose_most_of_the_cloth_are_rejected(needs_open3d):
+    """23 of 2700 points, as where a hand hides the cloth or a threshold failed."""
+    stream = make_clouds(count=800)
+    frames = [stream.frame(i) for i in range(len(stream))]
+    frames[7], frames[30], frames[31] = frames[7][:23], frames[30][:79], frames[31][:100]
+    torn = rec.PointClouds(stream.t, np.concatenate(frames), np.array([len(f) for f in frames]))
+    result = inspect(make_episode(points=torn)).frames["points"]
+    assert np.flatnonzero(result.rejected).tolist() == [7, 30]
+    assert "a tenth of the usual points" in result.criterion
+
+
+LINK = '<link name="tip">{}</link>'
+SOLID = "<collision><geometry>{}</geometry></collision>"
+
+
+@pytest.mark.parametrize(
+    ("solid", "camera_x", "match"),
+    [
+        ("", 0.0, "cam0 sees the arm 'hand', whose URDF has no solids: segmentation takes the arm for cloth"),
+        (SOLID.format('<mesh filename="a.stl"/>'), 0.0, "whose URDF has no solids of tip: "),
+        (SOLID.format('<sphere radius="0.1"/>'), 0.0, None),
+        ("", 9.0, None),
+    ],
+)
+def test_an_arm_without_solids_in_view_is_a_note(tmp_path, solid, camera_x, match):
+    pytest.importorskip("pytorch_kinematics")
+    joint = '<joint name="j" type="continuous"><parent link="base"/><child link="tip"/></joint>'
+    (tmp_path / "arm.urdf").write_text(f'<robot name="a"><link name="base"/>{LINK.format(solid)}{joint}</robot>')
+    pose = np.diag([1.0, -1.0, -1.0, 1.0])  # looks down from 2 m
+    pose[:3, 3] = camera_x, 0.0, 2.0
+    Image.fromarray(np.full((24, 32), 2000, np.uint16)).save(tmp_path / "0.png")
+    depth = rec.ImageStream("depth", np.arange(1), np.zeros(1), (tmp_path / "0.png",), (32, 24))
+    lens = {"width": 32, "height": 24, "K": np.array([[30.0, 0, 15.5], [0, 30, 11.5], [0, 0, 1]]), "depth_scale": 0.001}
+    recording = replace(
+        make_episode(),
+        joints={"hand": rec.JointMotion(np.arange(5) / 10, np.zeros((5, 1)), closed=np.ones(5, bool))},
+        robots={"hand": rec.RobotInfo(str(tmp_path / "arm.urdf"), np.eye(4), "tip")},
+        cameras={"cam0": rec.Camera(**lens, T_world_camera=pose, depth=depth)},
+    )
+    notes = [note for note in inspect(recording).notes if "sees the arm" in note]
+    assert len(notes) == (match is not None)
+    assert match is None or match in notes[0]
 
 
 def fold(*, cut=-np.inf, frames=60):

@@ -62,3 +62,8 @@ def test_the_cylinder_s_axis_is_z():
 def test_unknown_or_impossible_solids_are_refused(kind, size):
     with pytest.raises(InvalidInput):
         build_solid_mesh(kind, size, np.eye(4))
+
+
+def test_an_arm_without_solids_is_named():
+    with pytest.warns(UserWarning, match="no solid: an arm without solids hides nothing, .* it is taken for cloth"):
+        assert build_solid_meshes([]) == []

@@ -14,6 +14,7 @@ from .crop_planes import find_crop_planes
 from .nan_statistics import nan_median
 
 SIZE_TOLERANCE = 0.1  # of the cloth's size, for frames that are accepted
+MIN_POINT_FRACTION = 0.1  # of the median number of points; such a frame has lost most of the cloth
 MARKER_NEIGHBOURS = 4  # of a marker, whose distances are compared with the pattern
 AREA_NEIGHBOURS = 8  # of a point, whose distance gives the density of points
 CLUSTER_GAP_SPACINGS = 3.0  # times the median spacing, within which points belong to one cluster
@@ -113,7 +114,10 @@ def _neighbour_distance_ratios(markers: Markers) -> tuple[np.ndarray, str]:
 def check_cloud_frames(
     clouds: PointClouds, cloth: ClothInfo, gripper_positions: np.ndarray
 ) -> tuple[FrameChecks, list[str]]:
-    """Check frames of clouds: without outliers, none may exceed the cloth's diameter by more than 10 %.
+    """Check frames of clouds.
+
+    Without outliers, none may exceed the cloth's diameter by more than 10 %, or lose nine tenths of the points that
+    clouds usually have.
 
     Args:
         clouds: T frames.
@@ -137,8 +141,11 @@ def check_cloud_frames(
     length, area = cloth_size(cloth)
     extent = np.array([cloud_diameter(c) for c in inliers])
     seen = np.array([_surface_area(c) for c in inliers]) / (area or np.nan)
-    criterion = "larger than the cloth" if length else "none: the cloth's size is unknown"
+    criterion = "larger than the cloth, or a tenth of the usual points"
+    if not length:
+        criterion = "a tenth of the usual points; the cloth's size is unknown"
     rejected = np.greater(extent, (1 + SIZE_TOLERANCE) * length if length else np.inf) | (extent == 0)
+    rejected |= clouds.counts < MIN_POINT_FRACTION * np.median(clouds.counts)
     planes = find_crop_planes([clouds.frame(i) for i in range(len(clouds))], inliers, cloth, seen, gripper_positions)
     return FrameChecks(rejected, criterion, seen, removed, planes), notes
 

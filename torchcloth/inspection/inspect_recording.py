@@ -12,6 +12,7 @@ from ..recordings import Recording, size_checks, timing
 from ..recordings.timing import StreamTiming
 from ..robots.paths import GripperPath, gripper_paths, holding_paths  # pyright: ignore[reportMissingImports] - mapped from robots/
 from . import depth_images, frame_checks, noise
+from .arm_views import describe_unmodelled_arms
 from .depth_images import DepthSummary
 from .frame_checks import FrameChecks
 from .lag import LAG_CAVEAT, LagEstimate, estimate_lag
@@ -20,7 +21,8 @@ from .noise import NoiseEstimate
 CONVENTION = (
     "SI units. Times are on each stream's own clock. lag: observation stamps minus motion stamps of one event (the "
     "recording's clock_offset should be minus the lag); std: by jackknife over blocks of time. noise: one standard "
-    "deviation of a coordinate. rejected: frames whose lengths differ from the cloth's by more than 10 %. coverage: "
+    "deviation of a coordinate. rejected: frames whose lengths differ from the cloth's by more than 10 %, "
+    "and clouds of less than a tenth of the median number of points. coverage: "
     "fraction of the markers seen, or area seen divided by the cloth's area (to about 20 %, so it may exceed 1; both "
     "sides of a fold count, a hidden side does not)."
 )
@@ -104,6 +106,7 @@ def inspect(recording: Recording) -> Inspection:
                 depth[name] = summary
         except MissingDependency as error:
             notes.append(f"{name}: {error}")
+    notes += describe_unmodelled_arms(recording)
     return Inspection(
         recording,
         {name: timing.summarise_timing(kind, t) for name, (kind, t) in timing.stream_times(recording).items()},

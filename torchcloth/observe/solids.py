@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Iterable
 from typing import Any, Protocol
 
@@ -47,6 +48,12 @@ def build_solid_meshes(solids: Iterable[Solid], at: int | None = None) -> list[t
     for solid in solids:
         pose = solid.pose.detach().cpu().numpy() if hasattr(solid.pose, "detach") else np.asarray(solid.pose)
         placed.append(build_solid_mesh(solid.kind, solid.size, pose if at is None else pose[at]))
+    if not placed:
+        warnings.warn(
+            "no solid: an arm without solids hides nothing, and where a camera sees it, it is taken for cloth; add "
+            "boxes, cylinders or spheres to its URDF",
+            stacklevel=2,
+        )
     return placed
 
 
