@@ -544,3 +544,29 @@ def test_a_urdf_beside_the_scene_goes_into_the_episode(copy, tmp_path):
     episode = rec.write(recording, tmp_path / "ep")
     assert rec.read(episode).robots["arm"].model == "robots/arm/my.urdf"
     assert (episode / "robots" / "arm" / "my.urdf").is_file()
+
+
+@pytest.mark.parametrize(
+    ("name", "part", "match"),
+    [
+        ("tum", "rgb.txt", "a TUM RGB-D folder needs rgb.txt beside depth.txt; or build the episode in Python"),
+        ("redwood", "color", "Redwood RGB-D folder needs a folder color or rgb or image beside depth"),
+        (
+            "redwood",
+            "camera_intrinsic.json",
+            "needs camera_intrinsic.json or intrinsic.json or camera.json beside depth",
+        ),
+    ],
+)
+def test_a_folder_that_lacks_a_part_says_which(copy, name, part, match):
+    truth = copy(name)
+    path = truth.path / part
+    shutil.rmtree(path) if path.is_dir() else path.unlink()
+    refuse(truth, f"of no known format; .*{match}")
+
+
+def test_a_folder_of_point_clouds_says_what_to_do(tmp_path):
+    (tmp_path / "0000.pcd").write_text("# .PCD v0.7 - Point Cloud Data file format")
+    for path, what in ((tmp_path, "a folder with 0000.pcd"), (tmp_path / "0000.pcd", r"a point cloud \(PCD\)")):
+        with pytest.raises(RecordingError, match=f"got {what}; .*build PointClouds in Python"):
+            formats.read(path)

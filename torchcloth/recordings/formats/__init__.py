@@ -35,6 +35,8 @@ from .tum import TUM_IMPORTER
 IMPORTERS = (ROS2_IMPORTER, LEROBOT_IMPORTER, REDWOOD_IMPORTER, TUM_IMPORTER, KINECT_IMPORTER)
 EPISODE_FOLDER_FORMAT = "episode"
 FORMAT_NAMES = (EPISODE_FOLDER_FORMAT, *(importer.name for importer in IMPORTERS))
+CLOUD_SUFFIXES = {".pcd", ".ply", ".xyz", ".las", ".npy"}
+BUILD_IN_PYTHON_PAGE = "docs/how-to/import-recordings.md, Add the motion in Python"
 FOREIGN_SIGNATURES = {  # of files that are often confused with a recording
     b"PAR1": "a parquet file",
     b"\x89PNG": "a PNG image",
@@ -42,6 +44,8 @@ FOREIGN_SIGNATURES = {  # of files that are often confused with a recording
     b"PK\x03\x04": "a ZIP or NPZ archive",
     b"#ROSBAG V": "a ROS 1 bag",
     b"\x89HDF": "an HDF5 file",
+    b"# .PCD": "a point cloud (PCD)",
+    b"ply": "a point cloud or mesh (PLY)",
 }
 
 __all__ = ["FORMAT_NAMES", "SceneFile", "detect_format", "read", "write_mcap"]
@@ -60,13 +64,14 @@ def detect_format(path: str | Path) -> str:
         if path.is_dir() and is_present(path / reading.EPISODE_FILE):
             return EPISODE_FOLDER_FORMAT
         name = next((i.name for i in IMPORTERS if i.matches(path)), None)
+        remedy = "" if name else _remedy(path)
     except RecordingError:
         raise
     except (OSError, ValueError) as error:
         raise RecordingError(f"{path} cannot be read", got=error, expected="a recording") from error
     if name is None:
         expected = ", ".join(importer.title for importer in IMPORTERS) + ", or an episode folder"
-        raise RecordingError(f"{path} is of no known format", got=_content(path), expected=expected)
+        raise RecordingError(f"{path} is of no known format", got=_content(path), expected=expected, remedy=remedy)
     return name
 
 
@@ -100,6 +105,19 @@ def read(
     scene_file = SceneFile.read(None if scene is None else Path(scene))
     importer = next(importer for importer in IMPORTERS if detected == importer.name)
     return scene_file.complete_recording(importer.read(path, scene_file, episode), path)
+
+
+def _remedy(path: Path) -> str:
+    """Return what to do about a path that no importer reads."""
+    missing = next((text for importer in IMPORTERS if (text := importer.describe_missing(path))), "")
+    if missing:
+        return f"{missing}; or build the episode in Python ({BUILD_IN_PYTHON_PAGE})"
+    names = [p.suffix.lower() for p in path.iterdir()] if path.is_dir() else [path.suffix.lower()]
+    if not CLOUD_SUFFIXES.isdisjoint(names):
+        return f"files of point clouds are not read: build PointClouds in Python ({BUILD_IN_PYTHON_PAGE})"
+    if path.is_file() and path.suffix.lower() == ".parquet":
+        return "pass the folder of the LeRobot data set, which holds meta/info.json"
+    return ""
 
 
 def _content(path: Path) -> str:

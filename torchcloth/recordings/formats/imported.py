@@ -68,12 +68,14 @@ class Importer(NamedTuple):
         title: of the format, for people.
         matches: whether a path is of this format, by its content.
         read: reads (path, scene file, number of the episode or None).
+        describe_missing: what a path of this format lacks to be read; "" if it resembles another format or none.
     """
 
     name: str
     title: str
     matches: Callable[[Path], bool]
     read: Callable[[Path, Any, int | None], Imported]
+    describe_missing: Callable[[Path], str] = lambda path: ""
 
 
 class FileImages(ImageSource):

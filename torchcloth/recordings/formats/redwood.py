@@ -58,6 +58,18 @@ def matches(path: Path) -> bool:
     )
 
 
+def describe_missing(path: Path) -> str:
+    """Return what a folder lacks that has a folder of depth images."""
+    if not _has_folder(path, "depth") or any(is_present(path / name) for name in ("rgb.txt", "depth.txt")):
+        return ""
+    parts = {
+        f"a folder {' or '.join(COLOR_FOLDERS)}": any(_has_folder(path, name) for name in COLOR_FOLDERS),
+        " or ".join(INTRINSIC_FILES): any(is_present(path / name) for name in INTRINSIC_FILES),
+    }
+    missing = [what for what, is_there in parts.items() if not is_there]
+    return f"an Open3D/Redwood RGB-D folder needs {' and '.join(missing)} beside depth" if missing else ""
+
+
 def _has_folder(path: Path, name: str) -> bool:
     return is_present(path / name) and (path / name).is_dir()
 
@@ -182,4 +194,4 @@ def _poses(log: Path, count: int) -> np.ndarray:
     return poses
 
 
-REDWOOD_IMPORTER = Importer(REDWOOD_NAME, REDWOOD_TITLE, matches, read)
+REDWOOD_IMPORTER = Importer(REDWOOD_NAME, REDWOOD_TITLE, matches, read, describe_missing)

@@ -55,6 +55,13 @@ def matches(path: Path) -> bool:
     return all(is_present(path / file) for file in IMAGE_LIST_FILES.values())
 
 
+def describe_missing(path: Path) -> str:
+    """Return which image list a folder lacks that has another one."""
+    present = [file for file in IMAGE_LIST_FILES.values() if path.is_dir() and is_present(path / file)]
+    missing = sorted(set(IMAGE_LIST_FILES.values()) - set(present))
+    return f"a TUM RGB-D folder needs {' and '.join(missing)} beside {present[0]}" if present and missing else ""
+
+
 def read(path: Path, scene: SceneFile, episode: int | None) -> Imported:
     """Read the folder; the images are checked when they are copied.
 
@@ -152,4 +159,4 @@ def _truth(file: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return _stamps(rows, file), values[:, :3], quat
 
 
-TUM_IMPORTER = Importer(TUM_NAME, TUM_TITLE, matches, read)
+TUM_IMPORTER = Importer(TUM_NAME, TUM_TITLE, matches, read, describe_missing)
