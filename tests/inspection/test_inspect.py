@@ -198,6 +198,18 @@ def test_frames_that_lose_most_of_the_cloth_are_rejected(needs_open3d):
     assert "a tenth of the usual points" in result.criterion
 
 
+def test_points_without_a_reading_are_named(needs_open3d):
+    """(0, 0, 0) of a stereo camera, moved to the world with the others: all lie at its lens."""
+    stream = make_clouds(count=200)
+    xyz = stream.xyz.copy()
+    xyz[::10] = 0.4, -1.2, 1.1
+    notes = inspect(make_episode(points=replace(stream, xyz=xyz))).notes
+    assert any(
+        "10 % of the points repeat another of their frame, most of them at (0.4, -1.2, 1.1) m" in n for n in notes
+    )
+    assert not any("repeat another" in note for note in inspect(make_episode(points=stream)).notes)
+
+
 LINK = '<link name="tip">{}</link>'
 SOLID = "<collision><geometry>{}</geometry></collision>"
 

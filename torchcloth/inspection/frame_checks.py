@@ -15,6 +15,7 @@ from .nan_statistics import nan_median
 
 SIZE_TOLERANCE = 0.1  # of the cloth's size, for frames that are accepted
 MIN_POINT_FRACTION = 0.1  # of the median number of points; such a frame has lost most of the cloth
+MAX_REPEATED_FRACTION = 0.01  # of the points; measured points are never equal, but those stored in 0.1 mm may be
 MARKER_NEIGHBOURS = 4  # of a marker, whose distances are compared with the pattern
 AREA_NEIGHBOURS = 8  # of a point, whose distance gives the density of points
 CLUSTER_GAP_SPACINGS = 3.0  # times the median spacing, within which points belong to one cluster
@@ -146,8 +147,25 @@ def check_cloud_frames(
         criterion = "a tenth of the usual points; the cloth's size is unknown"
     rejected = np.greater(extent, (1 + SIZE_TOLERANCE) * length if length else np.inf) | (extent == 0)
     rejected |= clouds.counts < MIN_POINT_FRACTION * np.median(clouds.counts)
+    if (note := describe_repeated_point(clouds)) is not None:
+        notes.append(note)
     planes = find_crop_planes([clouds.frame(i) for i in range(len(clouds))], inliers, cloth, seen, gripper_positions)
     return FrameChecks(rejected, criterion, seen, removed, planes), notes
+
+
+def describe_repeated_point(clouds: PointClouds) -> str | None:
+    """Return a note if many points of frames lie exactly at one place, as where a sensor had no reading."""
+    frame = np.repeat(np.arange(len(clouds)), clouds.counts)
+    rows, counts = np.unique(np.column_stack([frame, clouds.xyz]), axis=0, return_counts=True)
+    repeated = int(counts[counts > 1].sum())
+    if repeated <= MAX_REPEATED_FRACTION * len(clouds.xyz):
+        return None
+    place = ", ".join(f"{x:.4g}" for x in rows[np.argmax(counts), 1:])
+    share = f"{100 * repeated / len(clouds.xyz):.2g} %"
+    return (
+        f"{share} of the points repeat another of their frame, most of them at ({place}) m: "
+        "where a sensor has no reading, it may give the place of its lens; leave these points out"
+    )
 
 
 def _segmentation_for(cloud: np.ndarray) -> Segmentation:
