@@ -17,7 +17,7 @@ UNPACKED_LIMIT_VARIABLE = "TORCHCLOTH_MAX_UNPACKED_GIB"
 MAX_UNPACKED_GIB = 8.0  # of one file; an hour of clouds of 10000 points at 30 Hz is 6 GiB
 MIN_SUSPECT_BYTES = 1 << 26  # files that unpack to less harm nobody, whatever their ratio
 MAX_UNPACKING_RATIO = 200.0  # unpacked over packed bytes; clouds have 2, a motion that never moves has 100
-GIB = 1 << 30
+BYTES_PER_GIB = 1 << 30
 
 
 def check_unpacked_size(unpacked: int, packed: int, place: str) -> None:
@@ -39,10 +39,10 @@ def check_unpacked_size(unpacked: int, packed: int, place: str) -> None:
     except ValueError:
         raise InvalidInput(UNPACKED_LIMIT_VARIABLE, got=repr(text), expected="a number of GiB") from None
     is_suspect = text is None and unpacked > MIN_SUSPECT_BYTES and unpacked > MAX_UNPACKING_RATIO * packed
-    if is_suspect or not unpacked <= limit * GIB:
+    if is_suspect or not unpacked <= limit * BYTES_PER_GIB:
         raise RecordingError(
             f"{place} unpacks to too much",
-            got=f"{unpacked / GIB:.3g} GiB in a file of {packed / GIB:.2g} GiB",
+            got=f"{unpacked / BYTES_PER_GIB:.3g} GiB in a file of {packed / BYTES_PER_GIB:.2g} GiB",
             expected=f"at most {limit:g} GiB"
             + (f" and {MAX_UNPACKING_RATIO:g} times the file" if text is None else ""),
             remedy=f"if you trust it, set {UNPACKED_LIMIT_VARIABLE} to a larger number",

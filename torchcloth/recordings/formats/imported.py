@@ -161,7 +161,7 @@ def check_depth_scale(depth: ImageStream, scale: float, path: Path, *, is_assume
 
 
 def order_by_stamp(stamps: Sequence[int], contents: Sequence[bytes], place: str) -> tuple[np.ndarray, list[str]]:
-    """Order messages by their stamps, without those that repeat the stamp and the content of another.
+    """Return which messages to use, in the order of their stamps, each once.
 
     Args:
         stamps: [N] ns, as recorded.
