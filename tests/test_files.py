@@ -1,10 +1,12 @@
 """Files are there whole or not at all."""
 
 import os
+import resource
 
 import pytest
+import torch
 
-from torchcloth._utils.files import write_atomically, write_text
+from torchcloth._utils.files import DISK_FULL_ERROR_NUMBERS, save_tensors, write_atomically, write_text
 
 
 def test_an_interrupt_while_writing_leaves_the_old_text(tmp_path, monkeypatch):
@@ -32,6 +34,22 @@ def test_the_systems_errors_name_the_file_that_was_asked_for(tmp_path):
     with pytest.raises(OSError, match="File name too long") as caught:
         write_text(path, "new")
     assert caught.value.filename == str(path)
+
+
+def test_a_disk_that_is_full_is_an_error_of_the_system(tmp_path):
+    """Reported under `ulimit -f 8`: torch.save raises "unexpected pos 1472 vs 1302"."""
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    save_tensors({"x": torch.zeros(3)}, tmp_path / "a.pt")
+    resource.setrlimit(resource.RLIMIT_FSIZE, (4096, limits[1]))
+    try:
+        with pytest.raises(OSError, match="File too large") as caught:
+            save_tensors({"x": torch.zeros(10_000)}, tmp_path / "a.pt")
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    assert caught.value.filename == str(tmp_path / "a.pt")
+    assert caught.value.errno in DISK_FULL_ERROR_NUMBERS
+    assert [file.name for file in tmp_path.iterdir()] == ["a.pt"]
+    assert torch.load(tmp_path / "a.pt", weights_only=True)["x"].shape == (3,)
 
 
 def test_the_suffix_is_kept(tmp_path):

@@ -94,7 +94,7 @@ def cloth_with(engine, part):
 
 
 def outcome(engine, part, batch=(), checkpoint=True):
-    cloth = cloth_with(engine, part)
+    cloth = cloth_with(engine, part).requires_grad_(True)  # also of facts about the world
     motion = make_opening_motion(END)
     state = make_perturbed_state(cloth, batch)
     pose = motion["left"].pose.clone().requires_grad_()

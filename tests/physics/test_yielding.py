@@ -123,7 +123,7 @@ def test_equal_stretches_have_the_derivative_of_the_closed_form():
 
 
 def test_gradients_at_rest_are_finite():
-    cloth = sheet()
+    cloth = sheet().requires_grad_(True)
     state = cloth.rest_state()
     x = state.x.clone().requires_grad_()
     out = cloth(state._replace(x=x), times=[0.0, 0.002])

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import errno
+import io
 import json
 import math
 import os
@@ -12,9 +14,12 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+import torch
+
 from ..errors import InvalidInput
 
 PROGRESS_FOLDER_NAME = "progress"  # within an output folder, while the work is not done
+DISK_FULL_ERROR_NUMBERS = (errno.ENOSPC, errno.EFBIG, errno.EDQUOT)
 
 
 @contextmanager
@@ -31,9 +36,23 @@ def write_atomically(path: Path) -> Iterator[Path]:
         finally:
             part.unlink(missing_ok=True)
     except OSError as error:
-        if str(error.filename) == str(part):  # the user does not know the temporary name
+        is_full = error.filename is None and error.errno in DISK_FULL_ERROR_NUMBERS
+        if is_full or str(error.filename) == str(part):  # the user does not know the temporary name
             error.filename, error.filename2 = str(path), None
         raise
+
+
+def save_tensors(content: Any, path: Path) -> Path:
+    """Write tensors with ``torch.save`` so that a crash leaves the old file or the new, never half; returns its path.
+
+    Raises:
+        OSError: the disk is full; ``torch.save`` alone raises an error of its own that does not say so.
+    """
+    buffer = io.BytesIO()
+    torch.save(content, buffer)
+    with write_atomically(path) as part:
+        part.write_bytes(buffer.getbuffer())
+    return path
 
 
 def write_text(path: Path, text: str) -> Path:

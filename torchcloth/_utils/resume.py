@@ -19,7 +19,7 @@ import torch
 from torch import Tensor
 
 from ..errors import InvalidInput
-from .files import write_atomically, write_text
+from .files import save_tensors, write_text
 
 STORE_FORMAT_VERSION = 2
 MAX_WRITE_ATTEMPTS = 3
@@ -103,8 +103,7 @@ class ResumableStore:
             with suppress(FileNotFoundError):
                 if not (self.folder / STAMP_FILE_NAME).exists():
                     write_text(self.folder / STAMP_FILE_NAME, self.key)  # several results may come at once
-                with write_atomically(path) as part:
-                    torch.save(result, part)
+                save_tensors(result, path)
                 return
 
 

@@ -14,6 +14,7 @@ from collections.abc import Sequence
 from importlib import metadata
 from typing import Any, NoReturn
 
+from .._utils.files import DISK_FULL_ERROR_NUMBERS
 from ..errors import InvalidInput, TorchclothError, to_message_part
 from . import bench, confirm, convert, diagnose, doctor, identify, inspect, plan, pose, predict, simulate, view
 
@@ -51,6 +52,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     Returns:
         Exit code: 0 done, 2 wrong input, 130 interrupted, 141 if the reader of stdout has closed it.
     """
+    for name in ("stdout", "stderr"):
+        if getattr(sys, name) is None:  # closed, as by >&-
+            setattr(sys, name, open(os.devnull, "w", encoding="utf-8"))  # noqa: SIM115 - for the rest of the process
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="backslashreplace")  # the terminal's encoding may lack a character
@@ -74,14 +78,24 @@ def _run(options: argparse.Namespace) -> int:
     except BrokenPipeError:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # Python flushes stdout when it exits
         return 141
+    except SystemExit as stop:
+        if isinstance(stop.__context__, BrokenPipeError):  # rich turns it into exit code 1
+            return 141
+        raise
     except (TorchclothError, OSError) as error:
         message = error if isinstance(error, TorchclothError) else _from_os_error(error)
-        print(f"torchcloth: {message}", file=sys.stderr)
+        is_full = isinstance(error, OSError) and error.errno in DISK_FULL_ERROR_NUMBERS
+        print(f"torchcloth: {message}{_how_to_resume(options) if is_full else ''}", file=sys.stderr)
         return 2
     except KeyboardInterrupt:
-        message = getattr(options, "stopped", "")
-        print(f"torchcloth: stopped{message(options) if callable(message) else message}", file=sys.stderr)
+        print(f"torchcloth: stopped{_how_to_resume(options)}", file=sys.stderr)
         return 130
+
+
+def _how_to_resume(options: argparse.Namespace) -> str:
+    """Return what the verb says after a stop, or nothing."""
+    message = getattr(options, "stopped", "")
+    return str(message(options) if callable(message) else message)
 
 
 def _warn(message: Warning | str, category: type[Warning], *where: Any, **help_text: Any) -> None:
@@ -94,6 +108,8 @@ def _from_os_error(error: OSError) -> TorchclothError:
     message = error.strerror or str(error)
     if error.filename is None:
         return InvalidInput("the system refuses", got=message)
+    if error.errno in DISK_FULL_ERROR_NUMBERS:
+        return InvalidInput(f"{error.filename}", got=message, expected="space to write it", remedy="free some space")
     expected = "a path that can be read and written"
     return InvalidInput(
         f"{error.filename}", got=message, expected=expected, remedy="choose another, or change its permissions"

@@ -13,7 +13,7 @@ from typing import Any
 import torch
 from lightning.pytorch.plugins.io import TorchCheckpointIO
 
-from torchcloth._utils.files import write_atomically
+from torchcloth._utils.files import save_tensors
 from torchcloth._utils.resume import DAMAGED_FILE_ERRORS
 from torchcloth.errors import InvalidInput
 
@@ -51,8 +51,7 @@ class AtomicCheckpointIO(TorchCheckpointIO):
 
     def save_checkpoint(self, checkpoint: dict[str, Any], path: Any, storage_options: Any = None) -> None:
         """Save a checkpoint with ``torch.save``; ``storage_options`` are ignored."""
-        with write_atomically(Path(path)) as part:
-            torch.save(checkpoint, part)
+        save_tensors(checkpoint, Path(path))
         for path in self.outdated:
             path.unlink(missing_ok=True)
         self.outdated.clear()
