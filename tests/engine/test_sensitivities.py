@@ -72,7 +72,7 @@ def test_cloth_that_sets_while_it_settles_and_hands_are_moved():
 
 def test_equal_reverse_mode():
     """Every direction against the same projection of a gradient."""
-    cloth = make_sheet("fused")
+    cloth = make_sheet("fused").requires_grad_(True)
     state, motion, times = make_perturbed_state(cloth), make_opening_motion(END), (0.0, 0.005, END)
     along = directions(cloth, state, motion)
     _, moved = cloth.sensitivities(state, motion, times, along=along)
