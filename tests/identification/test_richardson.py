@@ -30,7 +30,7 @@ def test_the_finer_mesh_is_the_same_cloth(model, recording):
 
 
 def test_a_finer_mesh_keeps_the_gap_between_layers(model):
-    touching = tc.Cloth(model.mesh, tc.materials.AEP(1e5), 0.2)
+    touching = tc.Cloth(model.mesh, tc.materials.AEP(1e5), 0.2, contact=tc.Contact())
     assert refine_cloth(touching).contact_grid().spacing == touching.contact_grid().spacing
 
 
