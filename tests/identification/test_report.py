@@ -81,7 +81,7 @@ def test_every_warning_comes_alone_with_its_reason(model, change, said):
 def test_layers_that_meet_are_noticed_where_contact_was_left_out(model, recording):
     (warning,) = warn(model, frames=[folded(model)])
     assert warning == "layers of the cloth come near each other, and contact was left out: fit with contact"
-    with_contact = tc.Cloth(model.mesh, tc.materials.AEP(4e4, 0.3), 0.3)
+    with_contact = tc.Cloth(model.mesh, tc.materials.AEP(4e4, 0.3), 0.3, contact=tc.Contact())
     assert warn(with_contact, frames=[folded(model)]) == []
 
 
