@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import combinations
 from typing import Any
 
 import numpy as np
@@ -41,6 +42,7 @@ MIN_FRAMES_OF_PART = 4  # of the beginning of an episode
 MAX_FIRST_CLOUD_OFFSET_FRACTION = 0.15  # median distance of the first cloud from the cloth, in the cloth's diagonals
 MAX_SILENTLY_DROPPED_READINGS_PER_FRAME = 0.1  # force readings after the last frame, above which there is a warning
 SAME_PATTERN_PLACE_M = 1e-6  # distance on the pattern within which two places are one
+MIN_EXCHANGE_GAIN_M, MIN_EXCHANGE_RATIO = 0.05, 2.0  # by which exchanged grippers are nearer, both together
 MAX_PATCH_TO_GRIPPER_M = 0.2  # distance of a held patch from its gripper's origin at the first frame
 TIME_TOLERANCE_S = 1e-6  # by which a frame may lie outside of the motion
 TIME_AFTER_KNOT_S = 1e-9  # added to a time, so that a knot at that time counts as passed
@@ -332,6 +334,7 @@ def build_episode(cloth: Cloth, recording: Recording, rate: float | None = None)
         raise RecordingError(f"{name}: no motion for grasp {missing[0]!r}", got=got)
     times, frames_after_motion = _frame_times(name, recording, motion, grasps, rate)
     initial = compute_initial_vertices(name, cloth, recording).to(dtype)
+    _check_not_exchanged(name, cloth, motion, initial, times[0])
     _check_gripper_distance(name, cloth, motion, initial, times[0])
     markers = streams.gather_markers(recording, times, dtype)
     camera, uv = find_depth_camera(recording), None if recording.markers is None else recording.markers.uv
@@ -451,6 +454,26 @@ def transfer_vertices(mesh: Mesh, recording: Recording, initial: Tensor) -> Tens
         )
     weights = interpolation_weights(Mesh.build(info.vertices, info.faces, info.uv), mesh.uv)
     return interpolate_on_pattern(weights, initial.double())
+
+
+def _check_not_exchanged(name: str, cloth: Cloth, motion: Mapping[str, Trajectory], x: Tensor, start: float) -> None:
+    """Refuse grippers that are each much nearer to the other's patch than to their own at the first frame."""
+    places = {}
+    for key, boundary in cloth.boundaries.items():
+        if isinstance(boundary, Grasp):
+            pose = interpolate_poses(motion[key], torch.tensor([start], dtype=torch.float64))
+            places[key] = (pose[0, :3, 3], x[boundary.index].mean(0))
+    for a, b in combinations(places, 2):
+        (hand_a, patch_a), (hand_b, patch_b) = places[a], places[b]
+        usual = float((hand_a - patch_a).norm() + (hand_b - patch_b).norm())
+        exchanged = float((hand_a - patch_b).norm() + (hand_b - patch_a).norm())
+        if usual > exchanged + MIN_EXCHANGE_GAIN_M and usual > MIN_EXCHANGE_RATIO * exchanged:
+            raise InvalidInput(
+                f"{name}: grasps {a!r} and {b!r}",
+                got=f"grippers {500 * usual:.0f} mm from their own patches, {500 * exchanged:.0f} mm from each other's",
+                expected="each gripper at its own patch",
+                remedy="exchange the names of the grippers, or of the grasps",
+            )
 
 
 def _check_gripper_distance(name: str, cloth: Cloth, motion: Mapping[str, Trajectory], x: Tensor, start: float) -> None:

@@ -1,0 +1,78 @@
+"""Checks of a recording before anything is fitted to it, and what can be mended."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+
+from ..errors import TorchclothError
+from ..recordings import PointClouds, Recording
+from ..robots.paths import holding_paths  # pyright: ignore[reportMissingImports] - mapped from robots/ at installation
+from .lag import estimate_lag
+
+MIN_CLOCK_PRIOR_STD_S = 0.01  # of a clock that was set by the estimated lag
+
+
+class CheckedRecording(NamedTuple):
+    """A recording after the checks.
+
+    Attributes:
+        recording: with what could be mended.
+        notes: what was found and done, in sentences; empty where nothing was.
+        clock_std: standard error of the clock [s], if the checks have set it; else None.
+    """
+
+    recording: Recording
+    notes: list[str]
+    clock_std: float | None
+
+
+def check_recording(recording: Recording) -> CheckedRecording:
+    """Check for frozen clouds and for a clock that is off, and mend both.
+
+    Args:
+        recording: an episode.
+    """
+    name = recording.path.name if recording.path else "recording"
+    recording, notes = _leave_out_frozen_clouds(name, recording)
+    try:
+        lag = estimate_lag(recording, holding_paths(recording))
+    except TorchclothError:  # no paths, so no lag; whoever needs them says so
+        lag = None
+    if lag is None or not lag.differs_from_recorded:
+        return CheckedRecording(recording, notes, None)
+    notes.append(
+        f"{name}: the observations come {1e3 * lag.value:.0f} ± {1e3 * lag.std:.0f} ms after the motion, and the "
+        f"recording says {1e3 * lag.recorded:.0f} ms: the clock was corrected, and its error is fitted"
+    )
+    return CheckedRecording(replace(recording, clock_offset=-lag.value), notes, max(lag.std, MIN_CLOCK_PRIOR_STD_S))
+
+
+def check_all(recordings: Sequence[Recording]) -> tuple[list[Recording], list[str], float | None]:
+    """Check several recordings; return them, all notes, and the largest standard error of a clock that was set."""
+    checked = [check_recording(recording) for recording in recordings]
+    stds = [c.clock_std for c in checked if c.clock_std is not None]
+    return [c.recording for c in checked], [note for c in checked for note in c.notes], max(stds, default=None)
+
+
+def find_frozen_clouds(clouds: PointClouds) -> np.ndarray:
+    """Return [T] bool: clouds that equal the one before bit for bit. A sensor's noise never repeats."""
+    frozen = np.zeros(len(clouds), dtype=bool)
+    for i in range(1, len(clouds)):
+        frozen[i] = np.array_equal(clouds.frame(i), clouds.frame(i - 1))
+    return frozen
+
+
+def _leave_out_frozen_clouds(name: str, recording: Recording) -> tuple[Recording, list[str]]:
+    points = recording.points
+    frozen = np.zeros(0, dtype=bool) if points is None else find_frozen_clouds(points)
+    if points is None or not frozen.any() or (~frozen).sum() < 2:
+        return recording, []
+    note = (
+        f"{name}: {frozen.sum()} of {len(points)} clouds equal the one before bit for bit: the camera was frozen, and "
+        "they were left out"
+    )
+    return replace(recording, points=points.select(~frozen)), [note]
