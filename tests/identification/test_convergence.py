@@ -1,4 +1,4 @@
-"""Searches that end without convergence: near the optimum they say something, elsewhere nothing."""
+"""Searches that end without convergence say nothing, and say so."""
 
 from dataclasses import replace
 
@@ -54,20 +54,16 @@ def test_the_papers_stop_at_a_start_that_is_far_off_says_nothing(brief_pull, mon
     assert any("paper's rule" in w and "times the sensor noise" in w for w in fit.warnings)
 
 
-def test_a_search_cut_short_at_the_noise_keeps_its_answer(brief, one_step):
-    fit = one_step
-    result = fit.parameters["youngs_modulus"]
+@pytest.mark.parametrize("noise_known", [True, False])
+def test_a_search_cut_short_near_the_optimum_says_nothing_either(model, brief, noise_known):
+    """After one step it is at the noise and a few standard errors off: its slopes promise that, and may be wrong."""
+    episode = brief if noise_known else replace(brief, observation_noise_std=None)
+    fit = identify(model, episode, ["youngs_modulus"], iterations=1)
     assert not fit.fit["converged"]
     assert fit.fit["rms_after"] < CONVERGENCE_CRITERIA.max_residual_over_noise * brief.observation_noise_std
-    assert result.identifiable
-    assert abs(result.value - twins.TRUE_FABRIC.membrane / twins.THICKNESS_M) < 3 * result.std
-
-
-def test_without_a_stated_noise_the_way_that_is_left_decides(model, brief):
-    """One step ends a few standard errors off, and the error allows for that."""
-    blind = replace(brief, observation_noise_std=None)
-    near = identify(model, blind, ["youngs_modulus"], iterations=1)
-    assert near.parameters["youngs_modulus"].identifiable
+    assert not fit.parameters["youngs_modulus"].identifiable
+    finished = identify(model, episode, ["youngs_modulus"])
+    assert finished.parameters["youngs_modulus"].identifiable
 
 
 @pytest.mark.slow

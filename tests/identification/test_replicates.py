@@ -199,6 +199,8 @@ def test_nuisances_of_an_episode_do_not_scatter():
         start=torch.zeros(1 + episodes),
         nuisances=[],
         cloth=SimpleNamespace(boundaries={}),
+        blocks=[None],
+        stated_noise=lambda block: 1.0,  # much larger than the residuals: no misfit
     )
     result = solution_covariance(objective, LinearityCheck(at, None, [], [])).diagonal().sqrt()
     alone = covariance(problem, at).diagonal().sqrt()

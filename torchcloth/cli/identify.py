@@ -133,6 +133,12 @@ def _add_options(parser: argparse.ArgumentParser) -> None:
         "--profile", nargs="+", default=[], metavar="NAME", help="find the interval by profile likelihood"
     )
     parser.add_argument(
+        "--checks",
+        action=argparse.BooleanOptionalAction,
+        default=True,
+        help="leave out frozen clouds, and correct a clock that is off (default: yes)",
+    )
+    parser.add_argument(
         "--refine",
         action=argparse.BooleanOptionalAction,
         help="correct for the coarseness of the mesh by one run on a mesh twice as fine (default: yes, but not with "
@@ -311,6 +317,7 @@ def _fit(options: argparse.Namespace, cloth: Cloth, episodes: list[Recording]) -
             priors=_parse_priors(options.prior),
             on_progress=advance,
             refine=_should_refine(options),
+            checks=options.checks,
         )
 
 

@@ -20,6 +20,7 @@ from ..episodes.observed import Episode, build_episode, check_recordings, requir
 from ..episodes.replay import Frames
 from ..episodes.unknowns import apply_priors, collect_unknowns
 from ..errors import InvalidInput, SimulationDiverged, UnstableStep
+from ..inspection.corrections import check_all
 from ..parameters import PhysicalParameter
 from ..recordings import Recording
 from .estimators import levenberg_marquardt
@@ -35,6 +36,7 @@ from .result import Identification
 from .uncertainty.consider_covariance import solution_covariance
 from .uncertainty.estimates import apply_profiles, make_estimates, make_nuisance_estimates, withdraw_estimates
 from .uncertainty.identifiability import describe_influences, find_combinations
+from .uncertainty.model_error import MODEL_ERRORS, ModelErrors, add_model_error
 from .uncertainty.profile_likelihood import compute_profiles
 from .uncertainty.replicates import assign_strata
 from .uncertainty.richardson import CORRECTION_UNCERTAINTY, EXTRAPOLATION_FACTOR, mesh_correction, refine_cloth
@@ -68,6 +70,8 @@ def identify(
     resume: bool | None = False,
     on_progress: Progress | None = None,
     refine: bool = False,
+    checks: bool = True,
+    model_errors: ModelErrors = MODEL_ERRORS,
 ) -> Identification:
     """Fit scalar parameters of a cloth to points, markers and forces, by gradients through the simulation.
 
@@ -110,6 +114,10 @@ def identify(
             its errors by what that leaves open (see ``uncertainty.richardson``). ``fit["mesh_correction"]`` has the
             largest correction in standard errors. It is not applied where the motion is chaotic, and not together
             with ``profile``.
+        checks: look for frozen clouds and for a clock that is off (``inspection.corrections``). Frozen clouds are left
+            out. A clock that is off is corrected, and becomes a nuisance. The warnings say so.
+        model_errors: what the parameters of two simulators of one cloth differ by; standard errors include it. Zeros
+            suit data from this very simulator only.
 
     Returns:
         Estimates with standard errors, distances, warnings, frames.
@@ -125,7 +133,12 @@ def identify(
     _check_chamfer_options(method, priors, nuisances, use)
     began = time.perf_counter()
     require_cpu(cloth)
-    recordings = check_recordings(recordings)
+    originals = recordings = check_recordings(recordings)
+    notes, nuisances = [], _as_mapping(nuisances)
+    if checks:
+        recordings, notes, clock_std = check_all(recordings)
+        if clock_std is not None and method not in CHAMFER_METHODS:
+            nuisances = {"clock": clock_std, **nuisances}
     if refine and profile:
         raise InvalidInput("profile", got="refine as well", expected="one of them: a profile is that of the given mesh")
     if refine:
@@ -153,8 +166,14 @@ def identify(
     search = Search(objective, stop, on_progress, assign_strata(recordings))
     before = objective.observe(objective.start)
     outcome = search.run(method, start, iterations, rate, not warm_start and stop != "paper", starts)
-    fit = _assemble_result(search, before, outcome, began, profile, recordings if refine else [])
-    return replace(fit, model=describe_model(cloth, fit, recordings, dt))
+    refine_recordings = recordings if refine else []
+    fit = _assemble_result(search, before, outcome, began, profile, refine_recordings, model_errors)
+    return replace(fit, model=describe_model(cloth, fit, originals, dt), warnings=[*notes, *fit.warnings])
+
+
+def _as_mapping(nuisances: Mapping[str, float | None] | Sequence[str]) -> dict[str, float | None]:
+    names = [nuisances] if isinstance(nuisances, str) else nuisances
+    return dict(names) if isinstance(names, Mapping) else dict.fromkeys(names)
 
 
 def _check_options(method: str, stop: str, iterations: int, starts: int) -> None:
@@ -239,6 +258,7 @@ def _assemble_result(
     began: float,
     profile: Sequence[str],
     refine_recordings: Sequence[Recording],
+    model_errors: ModelErrors,
 ) -> Identification:
     """Turn the end of a search into estimates, distances and warnings."""
     full, used, checked = search.objective, outcome.objective_used, outcome.checked
@@ -255,7 +275,8 @@ def _assemble_result(
     before, after, null = [s.x for s in start], [s.x for s in end], [carry_rigidly(e) for e in full.episodes]
 
     # estimates, with profiles where the whole motion is regular
-    estimates = make_estimates(full.cloth, full.unknowns, final.raw, covariance)
+    total_covariance = add_model_error(full.unknowns, final.raw, covariance, model_errors)
+    estimates = make_estimates(full.cloth, full.unknowns, final.raw, total_covariance)
     has_profiles = not (checked.warnings or checked.is_withdrawn)
     profiles = compute_profiles(used, final, covariance, profile, search.report_progress) if has_profiles else {}
     warnings += [] if has_profiles or not profile else [f"no profile of {', '.join(profile)}: {NO_PROFILE_REASON}"]
@@ -304,7 +325,7 @@ def _assemble_result(
         keys={u.name: u.key.removesuffix(".raw") for u in full.unknowns},
         nuisances=make_nuisance_estimates(full.episodes, full.nuisance_slices, final.raw, covariance, is_withdrawn),
         influences=describe_influences(full.unknowns, final.raw, checked.influence, estimates.parameters),
-        combinations=[] if is_withdrawn else find_combinations(full.unknowns, final.raw, covariance),
+        combinations=[] if is_withdrawn else find_combinations(full.unknowns, final.raw, total_covariance),
         profiles=profiles,
         forces_before=[_observed_forces(s.wrench, e) for s, e in zip(start, full.episodes, strict=True)],
         forces_after=[_observed_forces(s.wrench, e) for s, e in zip(end, full.episodes, strict=True)],

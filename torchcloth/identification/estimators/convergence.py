@@ -1,7 +1,8 @@
 """Whether a search that did not converge ended near enough to the optimum to say something.
 
-A search that ended at the noise has only flat directions left. Their errors are widened by the distance that remains.
-Slopes at an end that is far off say nothing about the optimum, and errors computed from them are far too small.
+A search that ended at the noise, and that its slopes lead no farther than a standard error, has only flat directions
+left. Its errors are widened by the distance that remains. Slopes at any other end say nothing about the optimum, and
+errors computed from them are far too small.
 """
 
 from __future__ import annotations
@@ -23,13 +24,13 @@ class ConvergenceCriteria:
         max_residual_over_noise: rms residual over the sensor noise. Searches that were cut short ended at 0.3 to 1.2,
             with errors that held, or at 1.4 to 6.
         max_prior_stds: standard deviations of the prior within which the remaining step is sought.
-        max_remaining_std_errors: standard errors to the predicted optimum. Searches that were cut short ended at 0.1
-            to 4, seldom up to 17, or at 12 to 100.
+        max_remaining_std_errors: standard errors to the predicted optimum. A converged search ends within 0.1; the
+            slopes of one that was cut short promise less than what remains.
     """
 
     max_residual_over_noise: float = 1.3
     max_prior_stds: float = 10.0
-    max_remaining_std_errors: float = 10.0
+    max_remaining_std_errors: float = 1.0
 
 
 CONVERGENCE_CRITERIA = ConvergenceCriteria()
@@ -40,7 +41,8 @@ def find_failure_reason(
 ) -> str:
     """Return why the end of an unfinished search is no estimate; empty where it may be one.
 
-    The residual decides where the sensor noise is known. Otherwise the distance decides that the slopes still ask for.
+    The residual must be near the sensor noise, where that is known, and the slopes must ask for no more than a step
+    that the error bars cover.
 
     Args:
         objective: of the frames that were used.
@@ -50,11 +52,10 @@ def find_failure_reason(
     episodes = objective.episodes if objective.uses("points", "markers") else []
     noise = max((e.noise_std for e in episodes if e.noise_std), default=math.nan)
     ratio = objective.distance_metrics(checked.final.raw).rms / noise
-    if math.isfinite(ratio):
-        is_off = ratio > criteria.max_residual_over_noise
-        return f"the residual is {ratio:.1f} times the sensor noise" if is_off else ""
+    if ratio > criteria.max_residual_over_noise:
+        return f"the residual is {ratio:.1f} times the sensor noise"
     if checked.covariance is not None:  # the slopes do not cover all data that were used
-        return ""
+        return "" if checked.final.converged else "simulations around it lead farther"
     remaining = remaining_std_errors(objective.problem(), checked.final, criteria)
     is_far = remaining > criteria.max_remaining_std_errors
     return f"its slopes lead {remaining:.0f} standard errors farther" if is_far else ""

@@ -28,6 +28,8 @@ class SolverSettings:
         max_trials: trial steps from one point before the solver gives up there.
         min_gain_ratio: actual over predicted decrease, below which the tangents misled a step.
         max_misled_steps: consecutive misled steps that end the search: such tangents say nothing about finite steps.
+        max_small_steps: consecutive steps below the tolerance, without an optimum, that end the search: it no longer
+            moves.
         broyden_tolerance: relative error of the predicted decrease up to which an updated Jacobian is good enough.
     """
 
@@ -39,6 +41,7 @@ class SolverSettings:
     max_trials: int = 6
     min_gain_ratio: float = 0.1
     max_misled_steps: int = 4
+    max_small_steps: int = 5
     broyden_tolerance: float = 0.1
 
 
@@ -195,10 +198,11 @@ def minimise(
 
     Returns:
         The last accepted point, linearised exactly. It has not converged if consecutive steps brought a small part of
-        what the tangents promised.
+        what the tangents promised, or went nowhere.
     """
     current = _linearise(problem, start)
-    stop, converged, damping, misled_steps = on_iterate(current), False, settings.initial_damping, 0
+    stop, converged, damping = on_iterate(current), False, settings.initial_damping
+    misled_steps = small_steps = 0
     for _ in range(iterations):
         if stop:
             break
@@ -216,9 +220,13 @@ def minimise(
             if before.exact and _is_near_minimum(problem, before, tolerance):
                 converged = True
                 break
+            small_steps += 1
+            stop = stop or small_steps == settings.max_small_steps
             current = _linearise(problem, trial.raw)
-        elif abs(gain_ratio - 1) > settings.broyden_tolerance and not stop:
-            current = _linearise(problem, trial.raw)
+        else:
+            small_steps = 0
+            if abs(gain_ratio - 1) > settings.broyden_tolerance and not stop:
+                current = _linearise(problem, trial.raw)
     last = current if current.exact else _linearise(problem, current.raw)
     return last._replace(converged=converged)
 

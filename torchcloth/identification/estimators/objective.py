@@ -131,9 +131,12 @@ class Objective:
 
     def noise_floor(self, block: Block) -> float:
         """Return the least standard deviation of a residual of this kind, in the block's unit."""
-        stds = [e.noise_std for e in self.episodes if e.noise_std is not None]
-        stated = max(stds) if stds and block.name == "points" else block.noise_floor
-        return self.noise_floors.get(block.name, stated)
+        return self.stated_noise(block) or block.noise_floor
+
+    def stated_noise(self, block: Block) -> float:
+        """Return the standard deviation of the noise that a user states, in the block's unit; 0 if none is stated."""
+        stds = [e.noise_std for e in self.episodes if e.noise_std is not None] if block.name == "points" else []
+        return self.noise_floors.get(block.name, max(stds, default=0.0))
 
     def clip(self, raw: Tensor) -> Tensor:
         """Return the nearest legal point [K]."""

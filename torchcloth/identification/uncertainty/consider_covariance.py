@@ -1,10 +1,13 @@
 """Covariance of a solution, with errors that were not fitted and yet widen the error bars (consider analysis).
 
-The noise of a measured first shape is damped out, but not where grippers hold the cloth. A sheet that is held half a
-millimetre too far apart shows a force that makes its stiffness seem some per cent larger.
+The noise of a measured first shape is damped out, but not where grippers hold the cloth, and no gripper holds it
+exactly where the recording says. A sheet that is held half a millimetre too far apart shows a force that makes its
+stiffness seem some per cent larger.
 """
 
 from __future__ import annotations
+
+import math
 
 import torch
 from torch import Tensor
@@ -14,7 +17,10 @@ from ..estimators import levenberg_marquardt
 from ..estimators.linearity import LinearityCheck
 from ..estimators.objective import Objective
 from ..nuisances import GraspOffset
+from .misfit import misfit_variance, split_residuals
 from .replicates import MIN_REPLICATES, jackknife_variance
+
+GRIP_STD_M = 1e-3  # by which a gripper holds the cloth beside the place that the recording says
 
 
 def solution_covariance(objective: Objective, checked: LinearityCheck, strata: Tensor | None = None) -> Tensor:
@@ -29,9 +35,12 @@ def solution_covariance(objective: Objective, checked: LinearityCheck, strata: T
     problem, count = objective.problem(), len(objective.episodes)
     sampled = checked.covariance
     covariance = levenberg_marquardt.covariance(problem, final) if sampled is None else sampled
+    episode = objective.episode_of_rows(final.linear)
+    variances = covariance.diagonal() + misfit_variance(problem, final, episode, lasting_misfit(objective, final))
+    covariance = levenberg_marquardt.inflate_covariance(covariance, variances)
     if count >= MIN_REPLICATES:
         strata = torch.zeros(count, dtype=torch.int64) if strata is None else strata
-        scatter = jackknife_variance(problem, final, objective.episode_of_rows(final.linear), strata)
+        scatter = jackknife_variance(problem, final, episode, strata)
         scatter[len(objective.unknowns) :] = 0.0  # without its episode a nuisance has no data, and no scatter
         covariance = levenberg_marquardt.inflate_covariance(covariance, scatter)
     if sampled is not None or checked.is_withdrawn:  # a withdrawn solution is not used
@@ -44,10 +53,21 @@ def solution_covariance(objective: Objective, checked: LinearityCheck, strata: T
     return add_initial_shape_noise(objective, final, covariance)
 
 
+def lasting_misfit(objective: Objective, at: levenberg_marquardt.Iterate) -> Tensor:
+    """Compute the mean square [B] of the misfit that lasts from frame to frame, for every block.
+
+    Where the noise of the points is stated, it includes what is slow, and only what exceeds it is misfit.
+    """
+    split = split_residuals(at, objective.episode_of_rows(at.linear))
+    stated = torch.tensor([objective.stated_noise(b) for b in objective.blocks]).to(split.total)[: len(split.total)]
+    excess = (split.total - stated.square()).clamp(min=0.0)
+    return torch.where(stated > 0, torch.minimum(split.lasting, excess), split.lasting)
+
+
 def add_initial_shape_noise(objective: Objective, final: levenberg_marquardt.Iterate, covariance: Tensor) -> Tensor:
     """Widen a covariance [K, K] by the noise of the held vertices, as a considered parameter (Schmidt 1966).
 
-    Nothing is added where the offset was fitted, or where the first shape or its noise are not measured.
+    Nothing is added where the offset was fitted, or where the first shape is not measured.
     """
     wider, is_considered = with_grasp_offsets(objective)
     if wider is objective:
@@ -64,18 +84,18 @@ def add_initial_shape_noise(objective: Objective, final: levenberg_marquardt.Ite
 def with_grasp_offsets(objective: Objective) -> tuple[Objective, Tensor]:
     """Add offsets of the grasps to the unknowns of an objective.
 
-    Each held vertex is taken to carry the noise of one point.
+    Each held vertex is taken to carry the noise of one point, and each grip an error of its own.
 
     Returns:
         The wider objective, and which of its unknowns [K] are these offsets. The objective itself where the offset is
-        fitted, or where the first shape or its noise are not measured.
+        fitted, or where the first shape is not measured.
     """
     is_fitted = any(nuisance.name == GraspOffset.name for nuisance in objective.nuisances)
     vertex_counts = [len(part.index) for part in objective.cloth.boundaries.values() if isinstance(part, Grasp)]
-    noises = [e.noise_std if e.needs_settling and e.noise_std else 0.0 for e in objective.episodes]
-    if is_fitted or not vertex_counts or max(noises) == 0.0:
+    noises = [e.noise_std or 0.0 for e in objective.episodes if e.needs_settling]
+    if is_fitted or not vertex_counts or not noises:
         return objective, torch.zeros(len(objective.start), dtype=torch.bool)
-    offset = GraspOffset(max(noises) / min(vertex_counts) ** 0.5)
+    offset = GraspOffset(math.hypot(GRIP_STD_M, max(noises) / min(vertex_counts) ** 0.5))
     wider = objective.with_nuisances([*objective.nuisances, offset])
     is_considered = torch.zeros(len(wider.start), dtype=torch.bool)
     for slices in wider.nuisance_slices:
