@@ -31,9 +31,8 @@ def change_moduli(world: World, weft: float = 0.0, shear: float = 0.0, stiffenin
         e2, g = warp, warp / (2 * (1 + nu))
         c = float(material.stiffening.value) if isinstance(material, StiffeningAEP) else 0.0
         if not (weft or shear):  # one modulus, which stays a parameter of fits
-            return world.with_cloth(
-                material=StiffeningAEP(warp, nu, stiffening=c + stiffening, thickness=material.thickness)
-            )  # type: ignore[union-attr,arg-type]
+            thickness: float = material.thickness  # type: ignore[assignment]
+            return world.with_cloth(material=StiffeningAEP(warp, nu, stiffening=c + stiffening, thickness=thickness))
     e2, g, c = e2 * (1 - weft), g * (1 + shear), c + stiffening
     new = OrthotropicAEP(
         warp,
