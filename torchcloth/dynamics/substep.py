@@ -4,9 +4,8 @@
 
 1. kinematics of the triangles (``kinematics.surface``);
 2. internal variables: plastic set, internal friction, creases (``elasticity.update_memory``);
-3. membrane stress (``elasticity.membrane_stress``). A director is a vector at each contact point that starts as the
-   surface normal and is compressed where layers press on each other. Its reaction is added to the stress
-   (``contact.self_contact.compute_director_forces``);
+3. membrane stress (``elasticity.membrane_stress``), and the reaction of the directors of triangles near another layer
+   (``contact.self_contact.find_contact_candidates``, ``compute_director_forces``);
 4. mass of the air that moves along (``forces.compute_added_mass_ratio``);
 5. forces f on the vertices, without the stiff viscous ones (``forces.vertex_forces``);
 6. stiff viscous forces on the old velocities, in stages (``viscous_stages.apply_viscous_stages``);
@@ -16,6 +15,9 @@
    (``contact.self_contact.contact_velocity_change``);
 9. boundaries: grasps and colliders, in order (``forces.apply_boundaries``);
 10. positions x + dt v, and the directors that they carry along (``contact.self_contact.advance_directors``).
+
+In float32 ``compensated_step`` also carries the rounding errors of the positions on. A director is a vector at each
+contact point that starts as the surface normal and is compressed where layers press on each other.
 
 Elasticity and effects act on the vertices, which carry all the mass; the grid carries only contact. That split makes
 the solution converge when the step is halved: forces that pass through the grid are filtered at every step.

@@ -1,35 +1,41 @@
 """Thresholds that decide whether a cause is named, and the gates that apply them.
 
-A candidate is a hypothesis that was fitted. To be named as a cause it passes these gates in this order. Gates 2 and 4
-only save work, and gate 7 takes the place of gate 6 for some hypotheses. Each line names the function that applies the
-gate and the class below that holds its numbers.
+A candidate is a hypothesis that was fitted. To be named as a cause it passes these gates in this order, here with their
+default numbers. Gates 2 and 4 limit the work; gate 2 may leave a likely hypothesis untried. Each line names the function
+that applies the gate and the class below that holds its numbers.
 
-1.  The score test calls the hypothesis present, or the expected gain of a fit is large: ``candidates.select_likely``
-    (``CandidateCriteria``), ``screening.ScoreTest`` (``ScreeningCriteria``).
-2.  It is among the four hypotheses with the largest expected gain. The next four are tried only if the best candidate
-    is implausibly large: ``candidates.propose_candidates``, ``candidates.evaluate_candidates`` (``CandidateCriteria``).
+1.  The score test calls the hypothesis present (z > 2.5, visible at 0.3 mm or 10 mN), or a fit would gain much (8 in log
+    density where it is visible, else 25): ``candidates.select_likely`` (``CandidateCriteria``), ``screening.screen``
+    (``ScreeningCriteria``).
+2.  It is among the 4 hypotheses with the largest expected gain. The next 4 are tried only if the best candidate is above
+    5 times its typical size: ``candidates.propose_candidates``, ``candidates.evaluate_candidates``
+    (``CandidateCriteria``).
 3.  It can be simulated and fitted: ``candidates.evaluate_candidates``, ``fitting.fit`` (``FitCriteria``).
-4.  It is fitted further if further steps promise much, unless they predict worse: ``candidates.evaluate_candidates``
+4.  It is fitted up to 3 steps further if they promise much, unless they predict worse:
+    ``candidates.evaluate_candidates`` (``CandidateCriteria``).
+5.  If a single motion has over 70 % of the information about it, its gain on held-out data is certain (lower 95 % bound
+    above 8, with two motions above 25): ``candidates.accept`` (``CandidateCriteria``, ``HeldOutCriteria``).
+6.  Its gain is surely positive, it removes a noticeable part of the misfit of held-out motions (2 % of the mean square,
+    0.3 mm, 5 mN, or a lower bound above 8), and positions get no worse: ``candidates.is_worthwhile``
     (``CandidateCriteria``).
-5.  If a single motion informs about it, its gain on held-out data is certain: ``candidates.accept``
-    (``CandidateCriteria``, ``HeldOutCriteria``).
-6.  It removes a noticeable part of the misfit of held-out motions: ``candidates.is_worthwhile``
+7.  Instead of gate 6, for a hypothesis that equals a fitted parameter: its gain is surely positive, or the data surely
+    contradict the data sheet: ``candidates.is_improvement``, ``candidates.contradicts_data_sheet``
     (``CandidateCriteria``).
-7.  A hypothesis that equals a fitted parameter is exempt from gate 6 if the data surely contradict the data sheet:
-    ``candidates.contradicts_data_sheet`` (``CandidateCriteria``).
-8.  Motions agree that its amplitude is not zero, by more than the mesh error: ``candidates.accept``
+8.  Motions agree that its amplitude is not zero (97.5 % quantile of Student's t; 1.96 for a first cause that removes a
+    third), by more than 1.96 times the mesh error: ``candidates.accept`` (``CandidateCriteria``).
+9.  No other motion contradicts it, and its amplitude is below 5 times the typical one: ``candidates.accept``
     (``CandidateCriteria``).
-9.  No other motion contradicts it, and its amplitude is plausible: ``candidates.accept`` (``CandidateCriteria``).
-10. It is not explained by the hypothesis that it implies: ``candidates.drop_implied`` (``CandidateCriteria``).
-11. It gains more than its permutations: ``permutation_test.run_permutation_test`` (``PermutationCriteria``).
+10. The hypothesis that it implies does not gain 80 % as much alone: ``candidates.drop_implied``
+    (``CandidateCriteria``).
+11. It gains more than 95 % of 40 permutations: ``permutation_test.run_permutation_test`` (``PermutationCriteria``).
 12. A further cause explains at least half of the remaining misfit: ``search.search`` (``SearchCriteria``).
 13. It survives backward elimination: ``backward_elimination.replace_by_implied``,
     ``backward_elimination.drop_redundant`` (``CandidateCriteria``, ``SearchCriteria``).
-14. All causes together explain enough of the misfit, otherwise all are dropped: ``search.search``
-    (``SearchCriteria``, ``AdequacyCriteria``).
-15. No local force law without a cause predicts much better: ``search.replace_by_law`` (``ResidualLawCriteria``,
-    ``SearchCriteria``).
-16. It, or something confounded with it, is relevant, and none of these is irrelevant:
+14. All causes together explain a third of the misfit (half of it where only motions with a lack of fit support them),
+    otherwise all are dropped: ``search.search`` (``SearchCriteria``, ``AdequacyCriteria``).
+15. No local force law without a cause gains half as much again as all causes together: ``search.replace_by_law``
+    (``ResidualLawCriteria``, ``SearchCriteria``).
+16. It, or something confounded with it, exceeds 0.75 of the smallest effect of interest, and each of these 0.5 of it:
     ``search.SearchResult.causes`` (``ConfoundingCriteria``, and ``RELEVANT_FRACTION`` and
     ``POSSIBLY_RELEVANT_FRACTION`` in ``torchcloth.episodes.world``).
 
