@@ -18,6 +18,7 @@ from helpers import foreign_formats
 import torchcloth as tc
 from torchcloth import recordings
 from torchcloth.cli import main
+from torchcloth.diagnosis.causes import hypotheses
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
@@ -142,6 +143,7 @@ def list_pages() -> list[Any]:
 def test_the_blocks_of_a_page_run(page, tmp_path, monkeypatch):
     torch.set_default_dtype(torch.float32)  # as in a reader's session
     monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(hypotheses, "_registered", [])  # a page may register a cause of its own
     namespace = PREPARE.get(page, lambda folder: {})(tmp_path)
     for number, block in enumerate(read_blocks(ROOT / page), start=1):
         exec(compile(block, f"{page}, block {number}", "exec"), namespace)

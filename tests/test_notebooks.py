@@ -24,13 +24,8 @@ def test_there_are_notebooks():
     assert NOTEBOOKS
 
 
-@pytest.mark.parametrize(
-    "path",
-    [
-        pytest.param(path, id=path.stem, marks=pytest.mark.slow if path.stem.startswith("02_") else ())
-        for path in NOTEBOOKS
-    ],
-)  # the second notebook diagnoses for minutes
+@pytest.mark.slow
+@each
 def test_it_runs(path, tmp_path, monkeypatch):
     from jupyter_client.manager import AsyncKernelManager
 

@@ -179,6 +179,7 @@ def test_the_map_of_residuals_says_which_part_of_the_fabric_a_row_is(with_drag):
     assert float(abs(fast[-4:]).mean()) > 3 * float(abs(fast[:4]).mean())
 
 
+@pytest.mark.slow
 def test_where_nothing_is_hidden_nothing_is_named():
     recordings = episodes(lambda world: world, seed=10)
     answer = diagnose(recordings, hypotheses=asked(recordings))

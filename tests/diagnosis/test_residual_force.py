@@ -109,6 +109,7 @@ def test_a_force_that_is_missing_is_learned():
     assert residual.gain.rms_after < 0.5 * residual.gain.rms_before
 
 
+@pytest.mark.slow
 def test_where_nothing_is_missing_nothing_is_learned():
     recordings = recorded(lambda world: world, 20)
     model = build_base_model(recordings[0])

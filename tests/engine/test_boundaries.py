@@ -211,6 +211,7 @@ def test_grips(hold, mobility, closed, air):
     assert torch.equal(run(cloth, state).x, run(perfect, state).x) == (hold == 100.0)
 
 
+@pytest.mark.slow
 def test_one_after_another():
     """What a boundary gives is what it changed, whatever came before and however often the loop ends."""
     effects = {"slip": GripSlip("hand", 0.1, 0.1), "more": GripSlip("hand", 0.2, 0.05), "air": AddedMass(0.05)}

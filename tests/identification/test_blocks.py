@@ -152,7 +152,7 @@ def test_force_gives_stiffness_without_a_density(pulled, model):
 def test_an_offset_that_is_not_fitted_widens_the_error(pulled, model, monkeypatch):
     """The first shape is off by half a millimetre at each jaw: unsaid, the error would be some 0.7 %."""
     plain = identify(model, pulled, ["youngs_modulus"]).parameters["youngs_modulus"]
-    monkeypatch.setattr(consider_covariance, "GRIP_STD_M", 0.0)
+    monkeypatch.setattr(consider_covariance, "CONSIDERED_GRIP_STD_M", 0.0)
     exact = replace(pulled, observation_noise_std=None)
     sure = identify(model, exact, ["youngs_modulus"]).parameters["youngs_modulus"]
     assert plain.std > 1.5 * sure.std

@@ -76,6 +76,7 @@ def test_intervals_cover_when_noise_is_independent(coverage):
     assert share(coverage[0.0]["naive"]) > 0.90  # here the simple formula is right: the toy is what it claims to be
 
 
+@pytest.mark.slow
 def test_intervals_cover_when_noise_is_shared_where_naive_ones_fail(coverage):
     """Half the variance belongs to a patch for five frames; the errors that count points are three times too small."""
     assert share(coverage[1.0]["naive"]) < 0.75

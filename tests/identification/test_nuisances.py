@@ -37,6 +37,7 @@ def objective(pulled):
     )
 
 
+@pytest.mark.slow
 def test_every_unknown_has_its_slope(objective):
     """Against central differences away from zero, where turns are not linear: markers, forces and points alike."""
     generator = torch.Generator().manual_seed(0)

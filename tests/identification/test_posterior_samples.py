@@ -29,6 +29,7 @@ def values(cloth, name):
     return cloth.get_submodule(find_scalar_parameters(cloth)[name]).value.item()
 
 
+@pytest.mark.slow
 def test_the_first_is_the_fit_and_the_others_scatter_as_it_says(fit):
     folder, recording, names = fit
     cloths = sample_posterior(folder, recording, 200)

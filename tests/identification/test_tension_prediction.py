@@ -62,6 +62,7 @@ def test_the_parameters_part_is_the_spread_of_the_covariance(fit):
     assert predict_tension(model, table).force.parameter_std[-1] == pytest.approx(np.std(forces), rel=0.2)
 
 
+@pytest.mark.slow
 def test_a_wrong_law_widens_the_interval_until_it_covers(tables):
     """45 degrees 30 % stiffer than any orthotropic law with the others has it: the strip at 30 is missed, and covered.
 
@@ -85,6 +86,7 @@ def test_a_wrong_law_widens_the_interval_until_it_covers(tables):
     assert missed == pytest.approx(share, rel=0.2), "the 45 degrees are missed by what was put in"
 
 
+@pytest.mark.slow
 def test_a_direction_is_left_out_with_all_its_tables(tables):
     """Of two strips at 45 degrees either tells what the other reads, and nothing of the law between directions."""
     twice = [*tables, make_readings(45, 0.03, np.random.default_rng(5), count=20)]

@@ -32,6 +32,9 @@ from torchcloth.training.ablation.scenes import (
 
 COARSE = Setup(triangles=150, pace=4.0)
 
+# A variant of a thousandth of k, whose layers pass through each other, is part of the ablation.
+pytestmark = pytest.mark.filterwarnings("ignore:contact. a stiffness k h of .* cannot carry")
+
 
 @pytest.mark.parametrize("garment", GARMENTS)
 @pytest.mark.parametrize("action", ["fling", "drag", "cover"])

@@ -32,6 +32,7 @@ def study(tmp_path_factory):
     return study
 
 
+@pytest.mark.slow
 def test_the_two_engines_agree_on_a_hanging_sheet_and_disagree_about_another_one(study):
     folder = study._episode("hang", 9)
     values, recording = FabricValues.from_truth(folder), read_remeshed(folder, 9)

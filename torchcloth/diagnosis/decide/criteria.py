@@ -1,22 +1,22 @@
 """Thresholds that decide whether a cause is named, and the gates that apply them.
 
-A candidate is a hypothesis that was fitted. To be named as a cause it passes these gates in this order, here with their
-default numbers. Gates 2 and 4 limit the work; gate 2 may leave a likely hypothesis untried. Each line names the function
-that applies the gate and the class below that holds its numbers.
+A candidate is a hypothesis that was fitted. To be named as a cause it passes these gates in this order, here with
+their default numbers. Gates 2 and 4 limit the work; gate 2 may leave a likely hypothesis untried. Each line names the
+function that applies the gate and the class below that holds its numbers.
 
-1.  The score test calls the hypothesis present (z > 2.5, visible at 0.3 mm or 10 mN), or a fit would gain much (8 in log
-    density where it is visible, else 25): ``candidates.select_likely`` (``CandidateCriteria``), ``screening.screen``
-    (``ScreeningCriteria``).
-2.  It is among the 4 hypotheses with the largest expected gain. The next 4 are tried only if the best candidate is above
-    5 times its typical size: ``candidates.propose_candidates``, ``candidates.evaluate_candidates``
+1.  The score test calls the hypothesis present (z > 2.5, visible at 0.3 mm or 10 mN), or a fit would gain much (8 in
+    log density where it is visible, else 25): ``candidates.select_likely`` (``CandidateCriteria``),
+    ``screening.screen`` (``ScreeningCriteria``).
+2.  It is among the 4 hypotheses with the largest expected gain. The next 4 are tried only if the best candidate is
+    above 5 times its typical size: ``candidates.propose_candidates``, ``candidates.evaluate_candidates``
     (``CandidateCriteria``).
 3.  It can be simulated and fitted: ``candidates.evaluate_candidates``, ``fitting.fit`` (``FitCriteria``).
 4.  It is fitted up to 3 steps further if they promise much, unless they predict worse:
     ``candidates.evaluate_candidates`` (``CandidateCriteria``).
-5.  If a single motion has over 70 % of the information about it, its gain on held-out data is certain (lower 95 % bound
-    above 8, with two motions above 25): ``candidates.accept`` (``CandidateCriteria``, ``HeldOutCriteria``).
-6.  Its gain is surely positive, it removes a noticeable part of the misfit of held-out motions (2 % of the mean square,
-    0.3 mm, 5 mN, or a lower bound above 8), and positions get no worse: ``candidates.is_worthwhile``
+5.  If a single motion has over 70 % of the information about it, its gain on held-out data is certain (lower 95 %
+    bound above 8, with two motions above 25): ``candidates.accept`` (``CandidateCriteria``, ``HeldOutCriteria``).
+6.  Its gain is surely positive, it removes a noticeable part of the misfit of held-out motions (2 % of the mean
+    square, 0.3 mm, 5 mN, or a lower bound above 8), and positions get no worse: ``candidates.is_worthwhile``
     (``CandidateCriteria``).
 7.  Instead of gate 6, for a hypothesis that equals a fitted parameter: its gain is surely positive, or the data surely
     contradict the data sheet: ``candidates.is_improvement``, ``candidates.contradicts_data_sheet``

@@ -20,7 +20,7 @@ from ..nuisances import GraspOffset
 from .misfit import misfit_variance, split_residuals
 from .replicates import MIN_REPLICATES, jackknife_variance
 
-GRIP_STD_M = 1e-3  # by which a gripper holds the cloth beside the place that the recording says
+CONSIDERED_GRIP_STD_M = 1e-3  # by which a gripper holds the cloth beside the place that the recording says
 
 
 def solution_covariance(objective: Objective, checked: LinearityCheck, strata: Tensor | None = None) -> Tensor:
@@ -95,7 +95,7 @@ def with_grasp_offsets(objective: Objective) -> tuple[Objective, Tensor]:
     noises = [e.noise_std or 0.0 for e in objective.episodes if e.needs_settling]
     if is_fitted or not vertex_counts or not noises:
         return objective, torch.zeros(len(objective.start), dtype=torch.bool)
-    offset = GraspOffset(math.hypot(GRIP_STD_M, max(noises) / min(vertex_counts) ** 0.5))
+    offset = GraspOffset(math.hypot(CONSIDERED_GRIP_STD_M, max(noises) / min(vertex_counts) ** 0.5))
     wider = objective.with_nuisances([*objective.nuisances, offset])
     is_considered = torch.zeros(len(wider.start), dtype=torch.bool)
     for slices in wider.nuisance_slices:
