@@ -56,6 +56,23 @@ def test_a_clock_that_is_off_is_set_within_its_error(late):
     assert "the clock was corrected" in checked.notes[0]
 
 
+def test_the_motion_still_covers_the_first_frame(late):
+    """A motion that begins with the first frame leaves no room for an earlier one."""
+    start = late.points.t[0]
+    hands = {name: clip_start(hand, start) for name, hand in late.grippers.items()}
+    checked = check_recording(replace(late, grippers=hands))
+    assert checked.notes
+    assert checked.recording.points.t[0] + checked.recording.clock_offset >= start
+    assert checked.clock_std > 0.5 * LAG_S
+
+
+def clip_start(hand, start):
+    later = hand.t > start
+    parts = (getattr(hand, name)[later] for name in ("position", "quat_wxyz", "closed"))
+    position, quat, closed = (np.concatenate([part[:1], part]) for part in parts)
+    return replace(hand, t=np.concatenate([[start], hand.t[later]]), position=position, quat_wxyz=quat, closed=closed)
+
+
 def test_a_clock_that_the_recording_sets_is_kept(late):
     right = replace(late, clock_offset=-LAG_S)
     assert check_recording(right).recording is right

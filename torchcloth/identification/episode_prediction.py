@@ -18,6 +18,7 @@ from ..episodes.observed import DEFAULT_FRAME_RATE_HZ, Episode, build_episode
 from ..episodes.replay import Frames, map_frames, simulate, simulate_with_tangents
 from ..episodes.unknowns import Unknown, collect_unknowns
 from ..errors import SimulationDiverged, UnstableStep
+from ..inspection.corrections import check_recording
 from ..losses import find_closest_points
 from ..losses.surface import point_distances
 from ..recordings import Recording
@@ -116,7 +117,7 @@ def predict_episode(
     check_size(recording)
     cloth = rebuild_fitted_cloth(path, fit, recording, build_start)
     unknowns, covariance = _fitted_unknowns(fit, cloth)
-    episode = build_episode(cloth, recording, DEFAULT_FRAME_RATE_HZ)
+    episode = build_episode(cloth, check_recording(recording).recording, DEFAULT_FRAME_RATE_HZ)
     raw = torch.tensor([u.start for u in unknowns], dtype=torch.float64)
     with explain_unstable_step(path):
         frames, tangents = simulate_with_tangents(cloth, unknowns, raw, episode, fit.dt)

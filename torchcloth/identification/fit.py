@@ -168,7 +168,7 @@ def identify(
     outcome = search.run(method, start, iterations, rate, not warm_start and stop != "paper", starts)
     refine_recordings = recordings if refine else []
     fit = _assemble_result(search, before, outcome, began, profile, refine_recordings, model_errors)
-    return replace(fit, model=describe_model(cloth, fit, originals, dt), warnings=[*notes, *fit.warnings])
+    return replace(fit, model=describe_model(cloth, fit, originals, recordings, dt), warnings=[*notes, *fit.warnings])
 
 
 def _as_mapping(nuisances: Mapping[str, float | None] | Sequence[str]) -> dict[str, float | None]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import NamedTuple
@@ -39,16 +40,26 @@ def check_recording(recording: Recording) -> CheckedRecording:
     name = recording.path.name if recording.path else "recording"
     recording, notes = _leave_out_frozen_clouds(name, recording)
     try:
-        lag = estimate_lag(recording, holding_paths(recording))
+        paths = holding_paths(recording)
+        lag = estimate_lag(recording, paths)
     except TorchclothError:  # no paths, so no lag; whoever needs them says so
-        lag = None
+        paths, lag = {}, None
     if lag is None or not lag.differs_from_recorded:
         return CheckedRecording(recording, notes, None)
     notes.append(
         f"{name}: the observations come {1e3 * lag.value:.0f} ± {1e3 * lag.std:.0f} ms after the motion, and the "
         f"recording says {1e3 * lag.recorded:.0f} ms: the clock was corrected, and its error is fitted"
     )
-    return CheckedRecording(replace(recording, clock_offset=-lag.value), notes, max(lag.std, MIN_CLOCK_PRIOR_STD_S))
+    # the motion must cover the first frame; what is left is for the fit
+    offset = max(-lag.value, max(path.t[0] for path in paths.values()) - _first_frame_time(recording))
+    std = math.hypot(max(lag.std, MIN_CLOCK_PRIOR_STD_S), offset + lag.value)
+    return CheckedRecording(replace(recording, clock_offset=offset), notes, std)
+
+
+def _first_frame_time(recording: Recording) -> float:
+    """Time of the first cloud, or of the first markers where there are no clouds [s], on the observation's clock."""
+    stream = recording.points if recording.points is not None else recording.markers
+    return math.inf if stream is None else float(stream.t[0])
 
 
 def check_all(recordings: Sequence[Recording]) -> tuple[list[Recording], list[str], float | None]:

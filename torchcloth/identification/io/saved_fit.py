@@ -19,6 +19,7 @@ from ...episodes.observed import DEFAULT_FRAME_RATE_HZ, Episode, build_cloth, bu
 from ...episodes.replay import Replay
 from ...episodes.unknowns import find_scalar_parameters
 from ...errors import InvalidInput, RecordingError, UnstableStep
+from ...inspection.corrections import check_recording
 from ...parameters import PhysicalParameter
 from ...recordings import Recording
 from ...recordings.consistency import merge_scene
@@ -64,15 +65,27 @@ class ReplayedEpisode:
 
 
 def describe_model(
-    cloth: Cloth, fit: Identification, recordings: Sequence[Recording], dt: float | None
+    cloth: Cloth,
+    fit: Identification,
+    recordings: Sequence[Recording],
+    corrected: Sequence[Recording],
+    dt: float | None,
 ) -> dict[str, Any]:
-    """Return the entry "model" of identification.json, with which ``replay_fit`` can repeat the simulation."""
+    """Return the entry "model" of identification.json, with which ``replay_fit`` can repeat the simulation.
+
+    Args:
+        cloth: where the fit began.
+        fit: the result.
+        recordings: the episodes.
+        corrected: the same after the checks, as they were fitted.
+        dt: largest substep [s].
+    """
     values = {name: _parameter(cloth, path).value.item() for name, path in find_scalar_parameters(cloth).items()}
     values |= {name: fit.parameters[name].value for name in fit.keys}
     faces = torch.as_tensor(cloth.mesh.faces)
     episodes = []
-    for recording, frames in zip(recordings, fit.frames_after, strict=True):
-        chamfer = distance_metrics([frames], [build_episode(cloth, recording)], faces).chamfer
+    for recording, used, frames in zip(recordings, corrected, fit.frames_after, strict=True):
+        chamfer = distance_metrics([frames], [build_episode(cloth, used)], faces).chamfer
         episodes.append({**fingerprint(recording), "chamfer": nan_to_none(chamfer)})
     return {
         "values": values,
@@ -105,7 +118,7 @@ def replay_fit(
     recording_fingerprint = fingerprint(recording)
     fitted_chamfers = [e["chamfer"] for e in fit.episodes if same_episode(e, recording_fingerprint)]
     cloth = rebuild_fitted_cloth(path, fit, recording, build_start)
-    data = build_episode(cloth, recording, DEFAULT_FRAME_RATE_HZ)
+    data = build_episode(cloth, check_recording(recording).recording, DEFAULT_FRAME_RATE_HZ)
     with torch.no_grad(), explain_unstable_step(path):
         frames = Replay(cloth)(data, fit.dt).x
     metrics = distance_metrics([frames], [data], torch.as_tensor(cloth.mesh.faces))
