@@ -7,7 +7,7 @@ VERIFY_ARGS ?=
 
 BIN := .venv/bin
 PIP := $(BIN)/python -m pip --quiet --quiet --disable-pip-version-check --no-input
-INSTALL := $(PIP) install --constraint constraints.txt
+INSTALL := $(PIP) install --no-compile --constraint constraints.txt
 LISTED := pyproject.toml constraints.txt
 PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest -q --durations=15 -n 2 --dist loadfile --no-loadscope-reorder
 OPEN3D_PACKAGES := libusb-1.0-0 libgl1 libegl1 libx11-6 libudev1 libidn2-0 libgomp1
@@ -23,7 +23,8 @@ help:  ## this list
 demo: .venv/.installed-demo  ## install the library with its robots and run the demonstration
 	$(BIN)/torchcloth demo
 
-test: .venv/.open3d-works lint types docs  ## install everything for development, then lint, types, docs and tests
+test: .venv/.open3d-works lint  ## install everything for development, then lint, types, docs and tests
+	@$(MAKE) --no-print-directory types & types=$$!; $(MAKE) --no-print-directory docs && wait $$types
 	$(PYTEST) $(PYTEST_ARGS)
 
 test-fast: .venv/.open3d-works  ## the tests that take less than about a second each: a developer's loop

@@ -515,6 +515,7 @@ def test_nothing_is_written_into_an_episode(verb, folder, capsys):
     assert sorted(folder.rglob("*")) == before
 
 
+@pytest.mark.slow
 def test_letters_that_a_terminal_does_not_have_end_no_work(folder, tmp_path):
     done = subprocess.run(
         [*COMMAND, "inspect", str(folder), "--out", str(tmp_path / "ν")],

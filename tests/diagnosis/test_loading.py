@@ -210,6 +210,7 @@ def test_a_late_clock_is_looked_at_beyond_the_last_frame(made, tmp_path):
     assert np.abs(x[-1] - punctual[-1]).max() > 1e-3  # the clock matters there
 
 
+@pytest.mark.slow
 def test_the_gain_is_confirmed_on_what_was_not_seen(made, tmp_path, capsys):
     folder, seen, blank = made
     models = [str(folder / name) for name in ("base.tcm", "extended.tcm")]

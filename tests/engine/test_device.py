@@ -180,7 +180,8 @@ def test_what_it_cannot_do_is_said():
             make_sheet(engine="fused")(make_perturbed_state(make_sheet()), make_opening_motion(TIMES[-1]), TIMES)
 
 
-@pytest.mark.parametrize("dtype", [pytest.param(torch.float64, marks=pytest.mark.slow), torch.float32])
+@pytest.mark.slow
+@pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
 def test_a_device_is_tried_once(dtype, monkeypatch):
     """On a fold that is pressed; one that does something else is not believed."""
     torch.set_default_dtype(dtype)

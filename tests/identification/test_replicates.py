@@ -64,7 +64,8 @@ def result(seed, count, motions=1, strata=None, scatter=True, **options):
     return at.raw - least_squares.TRUE_UNKNOWNS, matrix.diagonal().sqrt()
 
 
-@pytest.mark.parametrize("count", [3, pytest.param(6, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("count", [3, 6])
 def test_intervals_cover_what_differs_between_episodes(count):
     """95 % of 300; without the scatter far fewer, because within an episode all frames agree on a wrong value."""
     covered, blind = [], []
