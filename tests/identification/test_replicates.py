@@ -123,7 +123,7 @@ def test_only_replicates_scatter():
 
 @pytest.mark.parametrize("freedom", [2, 3, 4, 9, 50])
 def test_students_quantile(freedom):
-    assert student_quantile(freedom) == pytest.approx(scipy.stats.t.ppf(0.975, freedom), rel=0.035)
+    assert student_quantile(freedom) == pytest.approx(scipy.stats.t.ppf(0.975, freedom), rel=1e-12)
 
 
 def named(name, **split):

@@ -472,14 +472,10 @@ def inflate_covariance(covariance: Tensor, variances: Tensor) -> Tensor:
 
 
 def student_quantile(degrees_of_freedom: int) -> float:
-    """Return the 97.5 % quantile of Student's distribution (expansion of Fisher and Cornish).
+    """Return the 97.5 % quantile of Student's distribution."""
+    from scipy.special import stdtrit
 
-    It is 3.1 % low at two degrees of freedom and 0.2 % at four. Standard errors of all fits so far were widened by it,
-    so it stays until a change of numbers is due; ``scipy.special.stdtrit`` has the exact one.
-    """
-    z, n = Z_95, degrees_of_freedom
-    second = (5 * z**5 + 16 * z**3 + 3 * z) / (96 * n**2)
-    return z + (z**3 + z) / (4 * n) + second + (3 * z**7 + 19 * z**5 + 17 * z**3 - 15 * z) / (384 * n**3)
+    return float(stdtrit(degrees_of_freedom, 0.975))
 
 
 def _newey_west(scores: Tensor) -> Tensor:
