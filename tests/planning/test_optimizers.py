@@ -21,8 +21,7 @@ class Bowl:
 
     def __init__(self, bound=10.0, blocked=lambda at: False, diverges=lambda at: False):
         high = torch.full((2,), bound)
-        groups = torch.arange(2)
-        self.bounds = LinearBounds(torch.eye(2), -high, high, ["x", "y"], groups, groups)
+        self.bounds = LinearBounds(torch.eye(2), -high, high, ["x", "y"])
         self.blocked, self.diverges, self.seen = blocked, diverges, []
 
     def evaluate(self, at):

@@ -1,24 +1,23 @@
-"""Quadratic steps within linear bounds, by the dual problem."""
+"""Quadratic steps within linear bounds."""
 
 from __future__ import annotations
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from .motion_parameters import LinearBounds
 
-MAX_DUAL_ITERATIONS = 2000
-DUAL_CHECK_INTERVAL = 50  # iterations between two checks of convergence
 RIDGE_RATIO = 1e-10  # of the largest curvature; without it, rounding hides small curvatures where cloth is chaotic
-BOUND_TOLERANCE = 1e-5  # rad, rad/s, rad/s^2 (or m, m/s, m/s^2): how far a step may exceed a bound
+SOLVER_INFINITY = 1e30  # the solver's value for a bound that is absent
+BOUND_TOLERANCE = 1e-5  # rad, rad/s, rad/s^2 (or m, m/s, m/s^2): how far rounding may take a step beyond a bound
 
 
 def solve_constrained_step(at: Tensor, gradient: Tensor, curvature: Tensor, bounds: LinearBounds) -> Tensor:
     """Return the step that minimises a quadratic model while ``at + step`` stays within the bounds.
 
-    The step minimises ``gradient @ s + 0.5 * s @ curvature @ s``. The dual is maximised by accelerated gradient ascent
-    (Beck and Teboulle 2009) with restarts (O'Donoghue and Candes 2015): s = -curvature^-1 (gradient + rows^T dual). If
-    the ascent has not converged, the step is shortened, coordinate by coordinate, until it is within the bounds.
+    The step minimises ``gradient @ s + 0.5 * s @ curvature @ s``. The quadratic programme is solved exactly by the dual
+    active-set method DAQP (Arnstrom, Bemporad and Axehill 2022).
 
     Args:
         at: [N], a point within the bounds.
@@ -31,37 +30,35 @@ def solve_constrained_step(at: Tensor, gradient: Tensor, curvature: Tensor, boun
     """
     ridge = RIDGE_RATIO * float(curvature.diagonal().max()) * torch.eye(len(at)).to(curvature)
     root = torch.linalg.cholesky(curvature + ridge)
-    unconstrained = -torch.cholesky_solve(gradient[:, None], root)[:, 0]
+    whitened = -torch.linalg.solve_triangular(root, gradient[:, None], upper=False)[:, 0]
     value = bounds.rows @ at
     low, high = (bounds.low - value).clamp(max=0.0), (bounds.high - value).clamp(min=0.0)
-    change = bounds.rows @ unconstrained
-    if bool((change >= low).all() & (change <= high).all()):
-        return unconstrained
-
-    # Rows are scaled to unit response: a unit of their dual changes their own value by one.
-    response = torch.cholesky_solve(bounds.rows.mT, root)  # [N, R]
-    size = (bounds.rows * response.mT).sum(1).clamp(min=1e-30).sqrt()
-    rows, response = bounds.rows / size[:, None], response / size
-    low, high, tolerance = low / size, high / size, BOUND_TOLERANCE / size
-    rate = float(torch.linalg.matrix_norm(torch.linalg.solve_triangular(root, rows.mT, upper=False), 2)) ** 2
-    dual = extrapolated = torch.zeros_like(low)
-    momentum = 1.0
-    for k in range(MAX_DUAL_ITERATIONS):
-        change = rows @ (unconstrained - response @ extrapolated)
-        new = extrapolated + (change - (change + rate * extrapolated).clamp(low, high)) / rate
-        if float((extrapolated - new) @ (new - dual)) > 0:  # restart after an overshoot
-            momentum = 1.0
-        next_momentum = 0.5 * (1 + (1 + 4 * momentum**2) ** 0.5)
-        extrapolated = new + (momentum - 1) / next_momentum * (new - dual)
-        dual, momentum = new, next_momentum
-        if k % DUAL_CHECK_INTERVAL == DUAL_CHECK_INTERVAL - 1:
-            change = rows @ (unconstrained - response @ dual)
-            if bool((change >= low - tolerance).all() & (change <= high + tolerance).all()):
-                break
-    step = unconstrained - response @ dual
-
+    step = _unwhiten(root, whitened)
     change = bounds.rows @ step
-    room = (torch.where(change > 0, bounds.high - value, value - bounds.low) + BOUND_TOLERANCE).clamp(min=0.0)
-    fraction = torch.ones(int(bounds.unknown_group.max()) + 1).to(step)
-    fraction = fraction.scatter_reduce(0, bounds.row_group, room / change.abs().clamp(min=1e-300), "amin")
-    return step * fraction[bounds.unknown_group]
+    if bool((change >= low).all() & (change <= high).all()):
+        return step
+
+    import daqp
+
+    # In whitened coordinates y = root^T s the model is 0.5 |y - whitened|^2; constraints have unit normals.
+    normals = torch.linalg.solve_triangular(root, bounds.rows.mT, upper=False).mT  # [R, N]
+    size = normals.norm(dim=1).clamp(min=1e-15)
+    normals = np.ascontiguousarray((normals / size[:, None]).double().numpy())
+    identity, linear = np.eye(len(at)), -whitened.double().numpy()
+    for tolerance in (0.0, BOUND_TOLERANCE):  # rounding can make bounds that leave no room contradict each other
+        upper = ((high + tolerance) / size).double().clamp(max=SOLVER_INFINITY).numpy()
+        lower = ((low - tolerance) / size).double().clamp(min=-SOLVER_INFINITY).numpy()
+        solution, _, exit_flag, _ = daqp.solve(
+            identity, linear, normals, upper, lower, np.zeros(len(upper), dtype=np.int32)
+        )
+        if exit_flag <= 0:
+            continue
+        step = _unwhiten(root, torch.as_tensor(np.array(solution)).to(at))
+        change = bounds.rows @ step
+        room = torch.where(change > 0, high, -low) + BOUND_TOLERANCE
+        return step * float((room / change.abs().clamp(min=1e-300)).amin().clamp(max=1.0))
+    return torch.zeros_like(at)
+
+
+def _unwhiten(root: Tensor, whitened: Tensor) -> Tensor:
+    return torch.linalg.solve_triangular(root.mT, whitened[:, None], upper=True)[:, 0]

@@ -74,16 +74,12 @@ class LinearBounds(NamedTuple):
         low: [R], lower limits.
         high: [R], upper limits.
         names: R names, what each row limits.
-        row_group: [R] int64, number of the coordinate and gripper that a row limits.
-        unknown_group: [N] int64, the same of each unknown; no row depends on unknowns of two groups.
     """
 
     rows: Tensor
     low: Tensor
     high: Tensor
     names: list[str]
-    row_group: Tensor
-    unknown_group: Tensor
 
     @staticmethod
     def concatenate(motions: Sequence[GripperMotionParameters]) -> LinearBounds:
@@ -91,13 +87,7 @@ class LinearBounds(NamedTuple):
         parts = [motion.bounds() for motion in motions]
         rows = torch.block_diag(*(b.rows for b in parts))
         low, high = torch.cat([b.low for b in parts]), torch.cat([b.high for b in parts])
-        row_groups, unknown_groups, first = [], [], 0
-        for b in parts:
-            row_groups.append(first + b.row_group)
-            unknown_groups.append(first + b.unknown_group)
-            first += int(b.unknown_group.max()) + 1
-        names = [name for b in parts for name in b.names]
-        return LinearBounds(rows, low, high, names, torch.cat(row_groups), torch.cat(unknown_groups))
+        return LinearBounds(rows, low, high, [name for b in parts for name in b.names])
 
     def nearest_limit(self, at: Tensor) -> tuple[float, str]:
         """Return the fraction of the way from zero unknowns to the first limit, and the name of that limit."""
@@ -188,10 +178,7 @@ class GripperMotionParameters(ABC):
             names = [f"{DERIVATIVE_NAMES[order]} of {label} of {self.name}" for label in self.coordinate_names]
             parts.append((torch.kron(basis, identity), low.flatten(), high.flatten(), names * len(times)))
         rows, lows, highs, names = zip(*parts, strict=True)
-        all_names, coordinates = [name for part in names for name in part], torch.arange(len(identity))
-        row_group = coordinates.repeat(len(all_names) // len(identity))
-        unknown_group = coordinates.repeat(self.span.waypoints)
-        return LinearBounds(torch.cat(rows), torch.cat(lows), torch.cat(highs), all_names, row_group, unknown_group)
+        return LinearBounds(torch.cat(rows), torch.cat(lows), torch.cat(highs), [n for part in names for n in part])
 
 
 @dataclass(frozen=True, eq=False)
