@@ -8,6 +8,8 @@ VERIFY_ARGS ?=
 BIN := .venv/bin
 PIP := $(BIN)/python -m pip --quiet --quiet --disable-pip-version-check --no-input
 INSTALL := $(PIP) install --no-compile --constraint constraints.txt
+# Bytecode on all cores: pip uses one.
+BYTECODE := $(BIN)/python -m compileall -qq -j 0 .venv/lib torchcloth robots training benchmarks || true
 LISTED := pyproject.toml constraints.txt
 PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest -q --durations=15 -n 2 --dist loadfile --no-loadscope-reorder
 OPEN3D_PACKAGES := libusb-1.0-0 libgl1 libegl1 libx11-6 libudev1 libidn2-0 libgomp1
@@ -84,11 +86,13 @@ clean-all: clean  ## clean, and remove .venv
 .venv/.installed-demo: .venv/.torch $(LISTED)
 	@echo "installing torchcloth with robots"
 	@$(INSTALL) --editable '.[robots]'
+	@$(BYTECODE)
 	@touch $@
 
 .venv/.installed-dev: .venv/.torch $(LISTED)
 	@echo "installing torchcloth with everything for development"
 	@$(INSTALL) --editable '.[dev]'
+	@$(BYTECODE)
 	@touch .venv/.installed-demo $@
 
 # open3d's wheel needs libraries of the system. Root installs them, others are told how.
