@@ -26,7 +26,6 @@ LONG_FILES = (
     "test_device.py",
     "test_loading.py",
     "test_estimate.py",
-    "test_hidden_round.py",
     "test_contact.py",
     "test_replicates.py",
     "test_fuzz.py",

@@ -135,7 +135,8 @@ def test_few_readings_are_as_uncertain_as_few_are(rows, unknowns):
     assert 0.9 < share(torch.stack(hits)) < 0.99
 
 
-@pytest.mark.parametrize("rows", [4, pytest.param(6, marks=pytest.mark.slow), pytest.param(12, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("rows", [4, 6, 12])
 def test_few_readings_of_one_kind_are_few_beside_many_of_another(rows):
     """By the number of all, an interval that only four readings tell of held 84 % of truths."""
     many = 600

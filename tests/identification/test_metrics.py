@@ -86,7 +86,7 @@ def test_patches_cover_the_fabric_in_equal_parts():
 
 
 @pytest.mark.parametrize("side", [0.2, 0.3, 0.35, 0.6])
-@pytest.mark.parametrize("resolution", [9, 13])
+@pytest.mark.parametrize("resolution", [9, pytest.param(13, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("patterned", [True, False])
 def test_parts_and_rim_are_the_same_on_a_finer_mesh(side, resolution, patterned):
     """Squares, of which no axis is the longer one, and pieces of the rim that are shorter than a coarse edge."""

@@ -110,6 +110,7 @@ def test_episodes_shift_without_data_of_a_kind_do_not_scatter():
     )
 
 
+@pytest.mark.slow
 def test_only_replicates_scatter():
     """Two motions whose values differ by far more than replicates of one: that difference is not scatter."""
     strata, options = torch.tensor([1, 1, 1, 2, 2, 2]), {"motions": 2, "offset": 0.5}

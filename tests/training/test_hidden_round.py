@@ -1,7 +1,7 @@
 """A reduced round of hidden effects from end to end, on coarse meshes with two short episodes each.
 
 So little data separates few causes. The tests ask that large effects are named, that nothing false is, and that faults
-are seen. The thresholds have seen all ten cases. One case runs by default; the others are slow tests.
+are seen. The thresholds have seen all ten cases. All are slow tests.
 """
 
 import json
@@ -45,10 +45,9 @@ def check_round(folder, by_family: dict[str, list[dict]]) -> None:
     assert f"{len(cases)} cases, 0 of them sealed" in text
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
-    ("family", "seed"),
-    [("fault", WRONG_UNIT), pytest.param("single", ADDED_MASS, marks=pytest.mark.slow)],
-    ids=["a fault", "an effect"],
+    ("family", "seed"), [("fault", WRONG_UNIT), ("single", ADDED_MASS)], ids=["a fault", "an effect"]
 )
 def test_one_case_from_end_to_end(family, seed, tmp_path, monkeypatch):
     monkeypatch.setattr(hidden, "FAST_SEEDS", (seed,))

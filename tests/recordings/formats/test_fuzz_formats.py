@@ -23,7 +23,7 @@ from torchcloth import recordings as rec
 from torchcloth.errors import MissingDependency, TorchclothError
 from torchcloth.recordings import atomic_write, formats
 
-FEW, MANY = 100, 500
+FEW, MANY = 60, 500
 HEAD = 3000  # bytes at either end, where the structure is
 KINDS = ("depth", "color", "mask")
 
