@@ -14,7 +14,7 @@ from torchcloth.identification.estimators.levenberg_marquardt import minimise
 from torchcloth.identification.uncertainty.misfit import misfit_variance, split_residuals
 from torchcloth.identification.uncertainty.model_error import ModelErrors, add_model_error
 
-FRAMES, PARTS, POINTS = 40, 16, 12
+FRAMES, PARTS, POINTS = 40, 16, 30
 NOISE_M = 1e-3
 
 
