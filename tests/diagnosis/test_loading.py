@@ -250,6 +250,7 @@ def test_another_cloth_confirms_nothing(made, other):
         dx.confirm(folder / "base.tcm", folder / "extended.tcm", [unseen])
 
 
+@pytest.mark.slow
 def test_a_table_that_one_episode_has_is_in_the_scene_of_all(made):
     folder, _, _ = made
     plane = rec.Collider(np.array([0.0, 0.0, 1.004]), np.array([0.0, 0.0, 1.0]), 0.4)

@@ -78,6 +78,7 @@ def test_pressed_and_sliding(subdivisions):
     print(results, check_agreement(cloth, {}, state))
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("team")
 def test_with_air_hand_and_woven_cloth():
     """Contact between the other parts: the air resists what it does, the hand takes part of it."""

@@ -85,6 +85,7 @@ def simulated(cloth, times=TIMES):
     return out, {name: t.grad for name, t in named.items() if t.grad is not None}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("dtype", "mark"), [(torch.float64, 1e-9), (torch.float32, 1e-3)])
 @pytest.mark.parametrize("contact", [tc.Contact(), None])
 def test_the_layer(contact, dtype, mark):

@@ -264,6 +264,7 @@ def fold(*, cut=-np.inf, frames=60):
     return rec.Recording(cloth=cloth, grippers={"hand": grip}, provenance="synthetic: tests", points=points)
 
 
+@pytest.mark.slow
 def test_a_cloth_that_ends_is_not_cut_off(needs_open3d):
     assert inspect(fold()).frames["points"].crop_planes == {}
     result = inspect(fold(cut=-0.1)).frames["points"].crop_planes
