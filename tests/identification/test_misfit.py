@@ -9,7 +9,7 @@ from helpers import least_squares, twins
 
 from torchcloth.episodes.unknowns import collect_unknowns
 from torchcloth.errors import InvalidInput
-from torchcloth.identification import identify
+from torchcloth.identification import build_episode, identify
 from torchcloth.identification.estimators.levenberg_marquardt import minimise
 from torchcloth.identification.uncertainty.misfit import misfit_variance, split_residuals
 from torchcloth.identification.uncertainty.model_error import ModelErrors, add_model_error
@@ -98,3 +98,10 @@ def test_grippers_that_are_exchanged_are_refused(model, brief):
     hands = {"left": brief.grippers["right"], "right": brief.grippers["left"]}
     with pytest.raises(InvalidInput, match=r"'left' and 'right'.*exchange the names"):
         identify(model, replace(brief, grippers=hands), ["youngs_modulus"], iterations=1)
+
+
+def test_grippers_that_are_still_open_may_be_anywhere(model, brief):
+    """They come for the cloth later, so where they are at first says nothing of the names."""
+    open_ = {name: replace(hand, closed=hand.t > 0.2) for name, hand in brief.grippers.items()}
+    hands = {"left": open_["right"], "right": open_["left"]}
+    assert len(build_episode(model, replace(brief, grippers=hands)).clouds) == len(brief.points)

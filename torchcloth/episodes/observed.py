@@ -334,8 +334,9 @@ def build_episode(cloth: Cloth, recording: Recording, rate: float | None = None)
         raise RecordingError(f"{name}: no motion for grasp {missing[0]!r}", got=got)
     times, frames_after_motion = _frame_times(name, recording, motion, grasps, rate)
     initial = compute_initial_vertices(name, cloth, recording).to(dtype)
-    _check_not_exchanged(name, cloth, motion, initial, times[0])
-    _check_gripper_distance(name, cloth, motion, initial, times[0])
+    places = _gripper_places(cloth, motion, initial, times[0])
+    _check_not_exchanged(name, places)
+    _check_gripper_distance(name, places)
     markers = streams.gather_markers(recording, times, dtype)
     camera, uv = find_depth_camera(recording), None if recording.markers is None else recording.markers.uv
     is_late_reading = streams.find_force_times(recording, grasps) > times[-1] + float(np.diff(times).max())
@@ -456,13 +457,24 @@ def transfer_vertices(mesh: Mesh, recording: Recording, initial: Tensor) -> Tens
     return interpolate_on_pattern(weights, initial.double())
 
 
-def _check_not_exchanged(name: str, cloth: Cloth, motion: Mapping[str, Trajectory], x: Tensor, start: float) -> None:
-    """Refuse grippers that are each much nearer to the other's patch than to their own at the first frame."""
-    places = {}
+def _gripper_places(
+    cloth: Cloth, motion: Mapping[str, Trajectory], x: Tensor, start: float
+) -> dict[str, tuple[Tensor, Tensor]]:
+    """Places [3] m of each gripper and of the patch that it holds at the first frame, of those that are closed then.
+
+    A gripper that is open comes for the cloth later.
+    """
+    time, places = torch.tensor([start], dtype=torch.float64), {}
     for key, boundary in cloth.boundaries.items():
         if isinstance(boundary, Grasp):
-            pose = interpolate_poses(motion[key], torch.tensor([start], dtype=torch.float64))
-            places[key] = (pose[0, :3, 3], x[boundary.index].mean(0))
+            knot = int(find_last_knot(motion[key].t.double(), time + TIME_AFTER_KNOT_S))
+            if motion[key].closed[max(knot, 0)]:
+                places[key] = interpolate_poses(motion[key], time)[0, :3, 3], x[boundary.index].mean(0)
+    return places
+
+
+def _check_not_exchanged(name: str, places: Mapping[str, tuple[Tensor, Tensor]]) -> None:
+    """Refuse grippers that are each much nearer to the other's patch than to their own."""
     for a, b in combinations(places, 2):
         (hand_a, patch_a), (hand_b, patch_b) = places[a], places[b]
         usual = float((hand_a - patch_a).norm() + (hand_b - patch_b).norm())
@@ -476,23 +488,17 @@ def _check_not_exchanged(name: str, cloth: Cloth, motion: Mapping[str, Trajector
             )
 
 
-def _check_gripper_distance(name: str, cloth: Cloth, motion: Mapping[str, Trajectory], x: Tensor, start: float) -> None:
+def _check_gripper_distance(name: str, places: Mapping[str, tuple[Tensor, Tensor]]) -> None:
     """Refuse a cloth that is far from its grippers: only their increments move it, so nothing else would show."""
-    time = torch.tensor([start], dtype=torch.float64)
-    for key, boundary in cloth.boundaries.items():
-        if isinstance(boundary, Grasp):
-            knot = int(find_last_knot(motion[key].t.double(), time + TIME_AFTER_KNOT_S))
-            if not motion[key].closed[max(knot, 0)]:  # it comes for the cloth later
-                continue
-            pose = interpolate_poses(motion[key], time)
-            distance = float((x[boundary.index].mean(0) - pose[0, :3, 3]).norm())
-            if distance > MAX_PATCH_TO_GRIPPER_M:
-                raise InvalidInput(
-                    f"{name}: grasp {key!r}",
-                    got=f"the held patch {distance:.2f} m from its gripper at the first frame",
-                    expected=f"within {MAX_PATCH_TO_GRIPPER_M:g} m",
-                    remedy="give cloth.initial_vertices in world coordinates, or check the gripper's path and frame",
-                )
+    for key, (hand, patch) in places.items():
+        distance = float((patch - hand).norm())
+        if distance > MAX_PATCH_TO_GRIPPER_M:
+            raise InvalidInput(
+                f"{name}: grasp {key!r}",
+                got=f"the held patch {distance:.2f} m from its gripper at the first frame",
+                expected=f"within {MAX_PATCH_TO_GRIPPER_M:g} m",
+                remedy="give cloth.initial_vertices in world coordinates, or check the gripper's path and frame",
+            )
 
 
 def _times_within_motion(
