@@ -43,7 +43,7 @@ PORTABLE_LEVELS = {
     "arm64": {"armv8-a": frozenset()},
 }
 CLANG_FLAGS = "-fbracket-depth=16384 -fconstexpr-steps=200000000"  # its limits are lower than a kernel's trace
-DIGEST_MARK = b"torchcloth-sha256:"  # before the digest at the end of a file in the cache; ELF and cubin allow a tail
+DIGEST_MARK = b"torchcloth-sha256:"  # before the digest at the end of a file; the loader of libraries allows a tail
 KERNEL_BYTES_PER_CORE_SECOND = 420.0  # source that one core compiles in a second, measured with g++ 12
 
 
@@ -125,8 +125,14 @@ def cache_folders() -> list[Path]:
 def cached(name: str | None = None) -> Path | None:
     """Return a file in the cache, by default the library; None if it is not there, whole, and safe to load."""
     name = file_name() if name is None else name
-    files = (trusted_path(folder / name) for folder in cache_folders())
-    return next((file for file in files if file is not None and is_whole(file)), None)
+    files = (loadable_file(folder / name) for folder in cache_folders())
+    return next((file for file in files if file is not None), None)
+
+
+def loadable_file(path: Path) -> Path | None:
+    """Return the real path of a file of the cache; None if it is not there, whole, and safe to load."""
+    file = trusted_path(path)
+    return None if file is None or read_sealed(file) is None else file
 
 
 def trusted_path(path: Path) -> Path | None:
@@ -159,18 +165,13 @@ def _is_private(status: os.stat_result, is_last: bool) -> bool:
     return is_ours and (not (others_may_write or group_may_write) or (is_sticky_folder and not is_last))
 
 
-def is_whole(file: Path) -> bool:
-    """Return whether a file of the cache ends with the digest of what comes before: a power cut leaves half a file."""
+def read_sealed(file: Path) -> bytes | None:
+    """Return the content of a file of the cache without its digest; None if they disagree, as after a power cut."""
     try:
-        content = file.read_bytes()
+        content, mark, digest = file.read_bytes().rpartition(DIGEST_MARK)
     except OSError:
-        return False
-    return content == seal(content[: -len(seal(b""))])
-
-
-def seal(content: bytes) -> bytes:
-    """Return the content with its digest at the end, as files in the cache are stored."""
-    return content + DIGEST_MARK + hashlib.sha256(content).digest()
+        return None
+    return content if mark and digest == hashlib.sha256(content).digest() else None
 
 
 def store(target: Path, content: bytes) -> None:
@@ -178,7 +179,7 @@ def store(target: Path, content: bytes) -> None:
     with tempfile.TemporaryDirectory(dir=target.parent) as scratch:
         part = Path(scratch) / target.name
         with part.open("wb") as file:
-            file.write(seal(content))
+            file.write(content + DIGEST_MARK + hashlib.sha256(content).digest())
             file.flush()
             os.fsync(file.fileno())
         part.chmod(0o700)
@@ -201,7 +202,7 @@ def build(level: str | None = None) -> Path:
         with suppress(OSError):
             target = folder / name
             with _build_lock(folder):  # another process may be building the same
-                if trusted_path(target) is None or not is_whole(target):
+                if loadable_file(target) is None:
                     _compile(command, target, flags.split())
             return target
     places = ", ".join(str(f) for f in cache_folders())

@@ -50,9 +50,9 @@ class DeviceKernels:
         self._functions: dict[str, ctypes.c_void_p] = {}
         options = _options(threads, device)
         name = _file_name(text, options)
-        module, file = None, building.cached(name)
-        with suppress(OSError):
-            module = None if file is None else self._load(file.read_bytes())
+        file = building.cached(name)
+        code = None if file is None else building.read_sealed(file)
+        module = None if code is None else self._load(code)
         if module is None:  # there is no file, or its code does not load
             code = _compile(text, options)
             module = self._load(code)
