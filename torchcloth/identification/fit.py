@@ -28,7 +28,7 @@ from .estimators.objective import Objective
 from .estimators.search import CHAMFER_METHODS, ESTIMATION_METHODS, Method, Outcome, Progress, Search
 from .fit_warnings import fit_warnings, warn_of_skew
 from .io.saved_fit import describe_model
-from .nuisances import add_lookahead, implied_nuisances, select_nuisances
+from .nuisances import add_lookahead, as_stds, implied_nuisances, select_nuisances
 from .residuals.blocks import select_blocks
 from .residuals.metrics import distance_metrics, force_rms
 from .residuals.rigid_carry import carry_rigidly, find_unbeaten_null, mean_forces, zero_forces
@@ -44,7 +44,6 @@ from .uncertainty.richardson import CORRECTION_UNCERTAINTY, EXTRAPOLATION_FACTOR
 DEFAULT_MAX_ITERATIONS = 35  # of the DiffCP paper
 MAX_STARTS = 1000
 NO_PROFILE_REASON = "the motion can be predicted for a while only, or by simulations spread around the solution"
-CONTACT_PARAMETERS = ("contact_stiffness", "shear_stiffness", "cone")
 
 
 @isolated_grad_mode()
@@ -134,7 +133,7 @@ def identify(
     began = time.perf_counter()
     require_cpu(cloth)
     originals = recordings = check_recordings(recordings)
-    notes, nuisances = [], _as_mapping(nuisances)
+    notes, nuisances = [], as_stds(nuisances)
     if checks:
         recordings, notes, clock_std = check_all(recordings)
         if clock_std is not None and method not in CHAMFER_METHODS:
@@ -169,11 +168,6 @@ def identify(
     refine_recordings = recordings if refine else []
     fit = _assemble_result(search, before, outcome, began, profile, refine_recordings, model_errors)
     return replace(fit, model=describe_model(cloth, fit, originals, recordings, dt), warnings=[*notes, *fit.warnings])
-
-
-def _as_mapping(nuisances: Mapping[str, float | None] | Sequence[str]) -> dict[str, float | None]:
-    names = [nuisances] if isinstance(nuisances, str) else nuisances
-    return dict(names) if isinstance(names, Mapping) else dict.fromkeys(names)
 
 
 def _check_options(method: str, stop: str, iterations: int, starts: int) -> None:
@@ -242,7 +236,7 @@ def default_parameters(cloth: Cloth) -> list[str]:
     material = {name: part for name, part in cloth.material.named_modules() if isinstance(part, PhysicalParameter)}
     names = [name for name, part in material.items() if bool((part.value != 0).any())]
     if cloth.contact is None:
-        names = [name for name in names if name not in CONTACT_PARAMETERS]
+        names = [name for name in names if name not in cloth.material.contact_parameters]
     for key, effect in cast("Iterable[tuple[str, AbstractEffect]]", cloth.effects.items()):
         main = next(iter(effect.amplitudes))
         parameter = getattr(effect, main)

@@ -196,6 +196,12 @@ def implied_nuisances(uses: Collection[str], episodes: Sequence[Episode]) -> lis
     return ["rim"] if "points" in uses and has_points else []
 
 
+def as_stds(wanted: Mapping[str, float | None] | Sequence[str]) -> dict[str, float | None]:
+    """Return the standard deviation by name, None for the default, of names, a single name, or such a mapping."""
+    names = [wanted] if isinstance(wanted, str) else wanted
+    return dict(names) if isinstance(names, Mapping) else dict.fromkeys(names)
+
+
 def select_nuisances(
     wanted: Mapping[str, float | None] | Sequence[str], implied: Sequence[str] = ()
 ) -> list[AbstractNuisance]:
@@ -208,8 +214,7 @@ def select_nuisances(
     Raises:
         InvalidInput: an unknown name, or a standard deviation that is negative or not finite.
     """
-    wanted = [wanted] if isinstance(wanted, str) else wanted
-    stds = dict(wanted) if isinstance(wanted, Mapping) else dict.fromkeys(wanted)
+    stds = as_stds(wanted)
     for name, std in stds.items():
         if name not in NUISANCE_KINDS:
             raise InvalidInput("nuisance", got=repr(name), expected=f"one of {', '.join(NUISANCE_KINDS)}")

@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from ..estimators import levenberg_marquardt
-from ..estimators.levenberg_marquardt import Iterate, Linearised, Problem
+from ..estimators.levenberg_marquardt import Iterate, Problem
 
 
 class ResidualSplit(NamedTuple):
@@ -41,12 +41,10 @@ def split_residuals(at: Iterate, episode: Tensor) -> ResidualSplit:
         episode: [R] number of the episode of every row.
     """
     linear = at.linear
-    weight = (at.row_weights()[0] > 0).to(linear.residual)  # outliers do not count
-    weight = weight * (linear.residual != 0)  # nor does what was not observed
-    blocks = len(at.scale)
-    total, lasting = linear.residual.new_zeros(2, blocks)
-    for b in range(blocks):
-        rows = ((linear.blocks == b) & (weight > 0)).nonzero().squeeze(-1)
+    counts = (at.row_weights()[0] > 0) & (linear.residual != 0)  # no outlier, and nothing that was not observed
+    total, lasting = linear.residual.new_zeros(2, len(at.scale))
+    for b in range(len(at.scale)):
+        rows = ((linear.blocks == b) & counts).nonzero().squeeze(-1)
         if not len(rows):
             continue
         residual = linear.residual[rows]
@@ -75,7 +73,7 @@ def misfit_variance(problem: Problem, at: Iterate, episode: Tensor, lasting: Ten
         episode: [R] number of the episode of every row.
         lasting: [B] mean square of the lasting misfit.
     """
-    linear: Linearised = at.linear
+    linear = at.linear
     weighted = at.row_weights()[0][:, None] * linear.jacobian
     gain = torch.linalg.solve(levenberg_marquardt.information_matrix(problem, at), weighted.mT).abs()
     part = _number(linear.blocks, linear.error_group, episode)
