@@ -18,9 +18,7 @@ from ..errors import InvalidInput
 from ..types import Trajectory
 from .base import PrescribedMotion
 
-MAX_SAMPLING_INTERVAL_S = (
-    0.12  # knots up to this far apart are samples of a smooth motion (10 Hz), others are waypoints
-)
+MAX_SAMPLING_INTERVAL_S = 0.12  # knots nearer than this sample a smooth motion (10 Hz); others are waypoints
 MAX_SAMPLING_RATIO = 4.0  # between neighbouring intervals of samples: three lost in a row
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import replace
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -71,10 +72,8 @@ def check_all(recordings: Sequence[Recording]) -> tuple[list[Recording], list[st
 
 def find_frozen_clouds(clouds: PointClouds) -> np.ndarray:
     """Return [T] bool: clouds that equal the one before bit for bit. A sensor's noise never repeats."""
-    frozen = np.zeros(len(clouds), dtype=bool)
-    for i in range(1, len(clouds)):
-        frozen[i] = np.array_equal(clouds.frame(i), clouds.frame(i - 1))
-    return frozen
+    frames = np.split(clouds.xyz, np.cumsum(clouds.counts)[:-1])
+    return np.array([False, *(np.array_equal(a, b) for a, b in pairwise(frames))])
 
 
 def _leave_out_frozen_clouds(name: str, recording: Recording) -> tuple[Recording, list[str]]:

@@ -17,7 +17,11 @@ MAX_SCENE_EXTENT_M = 20.0  # no cloth experiment spans more; the same number in 
 MAX_BASE_DISTANCE_M = 100.0  # of a base or camera from a map's origin
 MAX_EPISODE_DURATION_S = 86_400.0
 MAX_EPOCH_S = 1e11  # since 1970; the year 5138
-EPOCH_UNITS = {"milliseconds": 1e14, "microseconds": 1e17, "nanoseconds": np.inf}  # stamps of this century are below
+EPOCH_UNITS = {  # limit that stamps of this century are below, and how many units a second has
+    "milliseconds": (1e14, 1e3),
+    "microseconds": (1e17, 1e6),
+    "nanoseconds": (np.inf, 1e9),
+}
 MAX_FINITE_VALUE = 1e100  # larger values count as infinite; squares of smaller ones stay finite
 UNIT_TOLERANCE = 1e-3  # quaternions and rotations are often stored as float32 or with four digits
 ROUNDING_TOLERANCE = 1e-9  # of R R^T or a length, below which the stored value is used as it is
@@ -87,8 +91,8 @@ def check_increasing(t: np.ndarray, place: str) -> None:
     if t.size == 0:
         raise RecordingError(f"{place} is empty", expected="at least one time", remedy="leave the stream out instead")
     if abs(t[0]) > MAX_EPOCH_S:
-        unit = next(name for name, limit in EPOCH_UNITS.items() if abs(t[0]) < limit)
-        remedy = f"divide the stamps by {1e3 if unit == 'milliseconds' else 1e6 if unit == 'microseconds' else 1e9:g}"
+        unit, per_second = next((name, n) for name, (limit, n) in EPOCH_UNITS.items() if abs(t[0]) < limit)
+        remedy = f"divide the stamps by {per_second:g}"
         raise RecordingError(f"{place} looks like {unit}", got=f"{t[0]:.13g}", expected="seconds", remedy=remedy)
     if (np.diff(t) <= 0).any():
         i = int(np.argmax(np.diff(t) <= 0))
