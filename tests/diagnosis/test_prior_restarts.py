@@ -109,6 +109,17 @@ def test_causes_with_which_positions_are_hardly_better_predicted_are_none(
     assert steps == ([first] if kept else [])
 
 
+def explain_everything(monkeypatch):
+    """Let all causes together pass the last gate."""
+    monkeypatch.setattr(search, "fraction_explained", lambda *_: 1.0)
+    monkeypatch.setattr(search, "has_lack_of_fit", lambda *_: False)
+    monkeypatch.setattr(
+        search,
+        "_compute_total_gain",
+        lambda *_: SimpleNamespace(rms_before=1.0, rms_after=0.5, explained_fraction=0.75),
+    )
+
+
 @pytest.mark.parametrize("better", [True, False])
 def test_the_next_cause_is_looked_for_from_both_or_from_the_better_one(monkeypatch, better):
     """The first step ends strained; the second sees the causes of both fits, or those of the new one alone."""
@@ -124,13 +135,7 @@ def test_the_next_cause_is_looked_for_from_both_or_from_the_better_one(monkeypat
         search, "evaluate_candidates", lambda current, setting, begun, *_: looked.append((current, begun))
     )
     monkeypatch.setattr(search, "drop_redundant", lambda current, steps, *_: (current, steps))
-    monkeypatch.setattr(search, "fraction_explained", lambda *_: 1.0)
-    monkeypatch.setattr(search, "has_lack_of_fit", lambda *_: False)
-    monkeypatch.setattr(
-        search,
-        "_compute_total_gain",
-        lambda *_: SimpleNamespace(rms_before=1.0, rms_after=0.5, explained_fraction=0.75),
-    )
+    explain_everything(monkeypatch)
     end, _, _ = search._search_stepwise(strained, SimpleNamespace(motions=["a"]), [CAUSE], lambda _: None, 4, first)  # type: ignore[arg-type]
     ((current, begun),) = looked
     assert current is end is (anew if better else strained)
@@ -151,13 +156,7 @@ def test_causes_are_doubted_again_where_all_are_fitted_on(monkeypatch, ahead):
     monkeypatch.setattr(
         search, "drop_redundant", lambda current, steps, *_: (doubted.append(current) or current, steps)
     )
-    monkeypatch.setattr(search, "fraction_explained", lambda *_: 1.0)
-    monkeypatch.setattr(search, "has_lack_of_fit", lambda *_: False)
-    monkeypatch.setattr(
-        search,
-        "_compute_total_gain",
-        lambda *_: SimpleNamespace(rms_before=1.0, rms_after=0.5, explained_fraction=0.75),
-    )
+    explain_everything(monkeypatch)
     end, _, _ = search._search_stepwise(far, SimpleNamespace(motions=["a"]), [CAUSE], lambda _: None, 4, first)  # type: ignore[arg-type]
     assert doubted == ([far, near] if ahead else [far])
     assert end is doubted[-1]

@@ -94,7 +94,7 @@ def run_twins(path: Path, twins: int, first: int = 0, refine: bool = False) -> l
 
 
 def main() -> None:
-    """Run the command."""
+    """Fit all twins and print how often the intervals hold the truth."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("out", type=Path)
     parser.add_argument("--twins", type=int, default=48)

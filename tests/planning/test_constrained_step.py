@@ -8,7 +8,7 @@ from torchcloth.planning.motion_parameters import LinearBounds
 
 
 def bounds_of(rows, low, high):
-    """Bounds without names."""
+    """Return linear bounds on all coordinates, without names."""
     return LinearBounds(rows, low, high, [""] * len(rows))
 
 

@@ -8,12 +8,12 @@ import torchcloth.robots as robots
 from torchcloth.errors import InvalidInput
 
 BOX = '<collision><geometry><box size="0.1 0.1 0.1"/></geometry></collision>'
-LIMIT = '<limit lower="-1" upper="1" velocity="2" effort="5"/>'
+JOINT_LIMIT_XML = '<limit lower="-1" upper="1" velocity="2" effort="5"/>'
 ARM = f"""<robot name="arm"><link name="base"/>
 <link name="tip"><inertial><mass value="1"/><inertia ixx="1" ixy="0" ixz="0" iyy="1" iyz="0" izz="1"/></inertial>
 {BOX}</link>
 <joint name="turn" type="revolute"><origin xyz="0 0 0.1" rpy="0 0 0"/><parent link="base"/><child link="tip"/>
-<axis xyz="0 0 1"/>{LIMIT}</joint></robot>"""
+<axis xyz="0 0 1"/>{JOINT_LIMIT_XML}</joint></robot>"""
 
 
 @pytest.fixture
@@ -41,7 +41,7 @@ def test_two_arms_whose_joints_have_the_same_names(write):
         f'<link name="{side}_base"/><link name="{side}_tip"/>'
         f'<joint name="mount_{side}" type="fixed"><origin xyz="0 {y} 0"/><parent link="world"/>'
         f'<child link="{side}_base"/></joint><joint name="joint1" type="revolute"><parent link="{side}_base"/>'
-        f'<child link="{side}_tip"/><axis xyz="0 0 1"/>{LIMIT}</joint>'
+        f'<child link="{side}_tip"/><axis xyz="0 0 1"/>{JOINT_LIMIT_XML}</joint>'
         for side, y in (("left", 0.4), ("right", -0.4))
     )
     path = write(text=f'<robot name="two"><link name="world"/>{arms}</robot>')

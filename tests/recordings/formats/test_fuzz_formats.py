@@ -23,7 +23,7 @@ from torchcloth import recordings as rec
 from torchcloth.errors import MissingDependency, TorchclothError
 from torchcloth.recordings import atomic_write, formats
 
-FEW, MANY = 60, 500
+DEFAULT_MUTANTS, SLOW_MUTANTS = 60, 500  # damaged files of each case
 HEAD = 3000  # bytes at either end, where the structure is
 KINDS = ("depth", "color", "mask")
 
@@ -252,25 +252,25 @@ def wrong_scenes(name: str, tmp_path: Path, count: int) -> Counter:
 
 @pytest.mark.parametrize("name", foreign_formats.WRITERS)
 def test_wrong_scenes(name, tmp_path):
-    assert wrong_scenes(name, tmp_path, FEW // 4)[False] > 0
+    assert wrong_scenes(name, tmp_path, DEFAULT_MUTANTS // 4)[False] > 0
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", foreign_formats.WRITERS)
 def test_many_wrong_scenes(name, tmp_path):
-    outcome = wrong_scenes(name, tmp_path, MANY)
+    outcome = wrong_scenes(name, tmp_path, SLOW_MUTANTS)
     print(name, dict(outcome))
-    assert outcome[False] > MANY / 4
+    assert outcome[False] > SLOW_MUTANTS / 4
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("case", CASES)
 def test_much_damage(case, tmp_path):
-    outcome = fuzz(case, tmp_path, MANY)
-    assert outcome["refused"] > MANY / 4
+    outcome = fuzz(case, tmp_path, SLOW_MUTANTS)
+    assert outcome["refused"] > SLOW_MUTANTS / 4
 
 
 @pytest.mark.parametrize("case", CASES)
 def test_damage(case, tmp_path):
-    count = round(SHARE.get(case, 1) * FEW)
+    count = round(SHARE.get(case, 1) * DEFAULT_MUTANTS)
     assert fuzz(case, tmp_path, count)["refused"] > count / 4
