@@ -199,15 +199,15 @@ def test_where_nothing_is_hidden_nothing_is_named():
     assert any("come after the motion's end" in text for text in judge(late, setting.motions).content["warnings"])
 
 
-def test_one_motion_is_refused(tmp_path, capsys):
-    only = [sheet_episodes.make_episode(), sheet_episodes.make_episode(duration=0.5)]
-    with pytest.raises(InvalidInput, match="at least two motions"):
-        diagnose(only)
-    with pytest.raises(InvalidInput, match="twice"):  # and not advice to name them apart
-        diagnose([only[0], only[0]])
-    folder = rec.write(only[0], tmp_path / "a")
-    assert main(["diagnose", str(folder), "--out", str(tmp_path / "out")]) == 2
-    assert "at least two motions" in capsys.readouterr().err
+def test_no_episode_and_one_given_twice_are_refused(tmp_path, capsys):
+    with pytest.raises(InvalidInput, match="episodes; got none"):
+        diagnose([])
+    only = sheet_episodes.make_episode()
+    with pytest.raises(InvalidInput, match="twice"):
+        diagnose([only, only])
+    folder = rec.write(only, tmp_path / "a")
+    assert main(["diagnose", str(folder), str(folder), "--out", str(tmp_path / "out")]) == 2
+    assert "twice" in capsys.readouterr().err
     assert not (tmp_path / "out").exists()
 
 

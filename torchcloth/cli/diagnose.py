@@ -21,9 +21,9 @@ def add(verbs: Any) -> None:
     parser = verbs.add_parser(
         "diagnose",
         help="find what a simulation of recorded episodes gets wrong, and why",
-        description="Find what a simulation of one cloth's episodes gets wrong, and why. The episodes must show at "
-        "least two motions (split.motion in episode.json). Writes diagnosis.json, report.html, base.tcm, extended.tcm "
-        "and the motion to record next.",
+        description="Find what a simulation of one cloth's episodes gets wrong, and why. A cause is named only if the "
+        "episodes show at least two motions (split.motion in episode.json); one motion gives a ranking of what would "
+        "explain it. Writes diagnosis.json, report.html, base.tcm, extended.tcm and the motion to record next.",
     )
     parser.add_argument("episodes", nargs="+", metavar="EPISODE", help="folders of episodes of one cloth")
     parser.add_argument("--model", metavar="MODEL", help="a .tcm file to start from (default: A-EP in vacuum)")

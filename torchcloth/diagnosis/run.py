@@ -56,7 +56,9 @@ def diagnose(
     """Find what a simulation of episodes gets wrong, and what correcting it gains.
 
     Args:
-        recordings: episodes of one cloth, at least two, with different motions (``split["motion"]``).
+        recordings: episodes of one cloth. Causes are named only if they show two motions (``split["motion"]``): one is
+            held out while the others are fitted. With a single motion the result ranks what would explain it, names no
+            cause, and proposes the motion to record next.
         model: start of the search; None: the base model of the first episode, in vacuum.
         hypotheses: what is asked about; None: the catalogue. With ``resume`` a name must mean what it meant before.
         progress: called with one line for each episode that is simulated.
@@ -65,23 +67,14 @@ def diagnose(
             start over, but refuse a folder where it could continue.
 
     Raises:
-        InvalidInput: fewer than two episodes, too few motions to hold one out, different cloths, one episode twice, a
-            default dtype other than float64, a model with a residual force, or hypotheses that ``register`` would
-            refuse.
+        InvalidInput: no episodes, different cloths, one episode twice, a default dtype other than float64, a model with
+            a residual force, or hypotheses that ``register`` would refuse.
         RecordingError: an episode without data that are needed.
         SimulationDiverged: the base model cannot be simulated.
     """
     # 1. Checks of the input.
     recordings = as_list(recordings)
     motions = label_motions(recordings)
-    if len(set(motions)) < 2:
-        reject_duplicates(recordings)  # a copy does not need another name
-        raise InvalidInput(
-            "episodes",
-            got=f"{len(recordings)} with motion {', '.join(sorted(set(motions))) or 'none'}",
-            expected="at least two motions: one is held out while the other is fitted",
-            remedy="record another motion, or name them apart (split.motion in episode.json)",
-        )
     if torch.get_default_dtype() != torch.float64:
         raise InvalidInput(
             "default dtype",
@@ -174,7 +167,7 @@ def _judge_with_unknowns(result: SearchResult, threads: int, progress: Progress)
         with _torch_threads(threads):  # one episode at a time, whose directions share the threads
             missing_force = estimate_missing_force(result.end, result.data, progress=progress)
     # laws find more than the lack of fit, because they know what it would look like
-    needs_laws = is_inadequate or (meshes_agree and not result.causes)
+    needs_laws = result.has_held_out_motions and (is_inadequate or (meshes_agree and not result.causes))
     residual_force = learn_residual_force(result.end, result.data, progress) if needs_laws else None
     return judge(result, result.data.motions, missing_force, residual_force)
 

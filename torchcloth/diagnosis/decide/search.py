@@ -11,7 +11,14 @@ from ...episodes.world_cache import none_if_impossible
 from ..data.dataset import DiagnosisData, Progress, prefix_progress
 from ..data.replicate_floor import ReplicateFloor, estimate_replicate_floor, find_replicate_pairs
 from ..inference.bifurcations import drop_bins, find_bifurcating_bins
-from ..inference.comparison import Gain, HeldOutPrediction, compare, list_observed_motions, predict_held_out
+from ..inference.comparison import (
+    Gain,
+    HeldOutPrediction,
+    compare,
+    has_held_out_motions,
+    list_observed_motions,
+    predict_held_out,
+)
 from ..inference.confounding import find_confounded
 from ..inference.fitting import ModelFit, fit, put_on_common_noise
 from ..inference.heterogeneity import propose_from_heterogeneity
@@ -62,7 +69,8 @@ class SearchResult:
         end: fit with all causes.
         accepted: the causes, those that are too small to be relevant among them.
         scores: score tests at the end.
-        held_out: predictions of held-out motions by the model at the start and at the end.
+        held_out: predictions of held-out motions by the model at the start and at the end; of a single motion, of
+            every other block of time windows by the others.
         total_gain: gain of all causes together; None without causes.
         noise_floor: RMS of a position bin [m]: of repetitions if there are any, else of the sensor.
         sensor_floor: RMS of a position bin by sensor noise and slow errors [m].
@@ -84,6 +92,11 @@ class SearchResult:
     data: DiagnosisData
     withdrawn: tuple[str, ...] = ()
     not_simulated: tuple[str, ...] = ()
+
+    @property
+    def has_held_out_motions(self) -> bool:
+        """Whether the episodes show two motions, without which no cause is named."""
+        return has_held_out_motions(self.end.whitened.episode, self.data.motions)
 
     @property
     def causes(self) -> list[AcceptedCause]:
@@ -147,7 +160,7 @@ def search(
     """Accept causes one after the other until no candidate may be named.
 
     If none may be named, the search starts again from the data sheet, then from parameters about which motions
-    disagree.
+    disagree. With a single motion the base model is fitted and screened, and no cause is searched for.
 
     Args:
         model: the base model at the data sheet.
@@ -161,6 +174,9 @@ def search(
     keys = find_bifurcating_bins(start, data, prefix_progress(progress, "bifurcating bins"))
     if any(map(len, keys)):
         data, start = data.without_bins(keys), drop_bins(start, keys)
+    if not has_held_out_motions(start.whitened.episode, data.motions):
+        not_simulated = tuple(_list_not_simulated(start, hypotheses))
+        return replace(_summarise(start, SearchPath(start, [], data)), not_simulated=not_simulated)
     path = _search_stepwise(start, data, hypotheses, progress, CRITERIA.candidate.max_tried)
     if not path.accepted:
         path = _search_from_prior(start, data, hypotheses, progress)
@@ -392,13 +408,20 @@ def _predict_start_and_end(
     start: ModelFit, current: ModelFit, accepted: list[AcceptedCause], data: DiagnosisData
 ) -> tuple[HeldOutPrediction, HeldOutPrediction]:
     first, last = put_on_common_noise(start, current)
-    sole = sole_informative_motions(accepted)
-    return predict_held_out(first, data.motions, sole), predict_held_out(last, data.motions, sole)
+    halved = _list_halved_motions(current, accepted, data)
+    return predict_held_out(first, data.motions, halved), predict_held_out(last, data.motions, halved)
+
+
+def _list_halved_motions(fitted: ModelFit, accepted: list[AcceptedCause], data: DiagnosisData) -> set[str]:
+    """Return the motions of which halves are held out: the informative one of a cause, or the only one."""
+    if not has_held_out_motions(fitted.whitened.episode, data.motions):
+        return set(data.motions)
+    return sole_informative_motions(accepted)
 
 
 def _summarise(start: ModelFit, path: SearchPath) -> SearchResult:
     current, accepted, data = path
-    last = predict_held_out(current, data.motions, sole_informative_motions(accepted))
+    last = predict_held_out(current, data.motions, _list_halved_motions(current, accepted, data))
     # slow errors that were fitted may be the model's own, so the floor has the smallest ones
     sensor_floor = compute_noise_floor(current.linearisation, minimal_noise())
     replicate_floor = estimate_replicate_floor(last, find_replicate_pairs(data.recordings, data.episodes))

@@ -35,6 +35,7 @@ from ..unknown.missing_force import MissingForce
 from ..unknown.residual_force import ResidualForceFit
 from .candidates import AcceptedCause, look_up_t_quantile
 from .criteria import CRITERIA
+from .in_sample import rank_in_sample
 from .search import SearchResult
 
 SCHEMA = "torchcloth.diagnosis/1"
@@ -50,8 +51,8 @@ class Diagnosis:
     Attributes:
         verdict: "identified" (each cause stands alone), "ambiguous" (some causes are confounded with others),
             "unexplained" (a lack of fit that no known cause explains), "adequate" (no known cause is surely relevant),
-            "inconclusive" (these data cannot say), "numerics" (another mesh changes more than a cause would),
-            "invalid_data" (an episode cannot be used, and nothing was simulated).
+            "inconclusive" (these data cannot say, or a known cause would explain a single motion), "numerics" (another
+            mesh changes more than a cause would), "invalid_data" (an episode cannot be used; nothing was simulated).
         content: the content of diagnosis.json.
         optional_search: the search; None of invalid data.
         missing_force: the force that is missing; None without a lack of fit.
@@ -116,15 +117,19 @@ def judge(
     is_inadequate = is_inadequate or any(c["motions_disagree"] for c in causes)
 
     relevant_rivals = [r["effect"] for m in minor for r in m["rivals"]]
-    is_doubtful = bool(relevant_rivals or result.end.model.strained_parameters)
+    explanations = [explanation.as_dict() for explanation in rank_in_sample(result)]
+    is_doubtful = bool(relevant_rivals or result.end.model.strained_parameters or explanations)
     meshes_agree = all(row.meshes_agree for row in rows)
-    verdict = _decide(result, causes, is_inadequate, meshes_agree, is_doubtful)
+    # a motion that could be explained is not unexplained, though nothing confirms the explanation
+    verdict = _decide(result, causes, is_inadequate and not explanations, meshes_agree or is_inadequate, is_doubtful)
     content = {
         "schema": SCHEMA,
         "verdict": verdict,
         "causes": causes,
         "initial_causes": _describe_initial_causes(result, motions),
         "minor": minor,
+        "in_sample": explanations,
+        "single_motion": not result.has_held_out_motions,
         "ruled_out": [s.hypothesis.name for s in scores if s.decision == "absent"],
         "wrong_sign": [s.hypothesis.name for s in scores if s.has_wrong_sign],
         "undecided": [
@@ -164,8 +169,8 @@ def refuse(faults: Sequence[Fault], motions: Sequence[str] = ()) -> Diagnosis:
         motions: label of each episode.
     """
     lists = (
-        "causes", "initial_causes", "minor", "ruled_out", "wrong_sign", "undecided", "unresolvable", "lack_of_fit",
-        "force_drifts", "warnings",
+        "causes", "initial_causes", "minor", "in_sample", "ruled_out", "wrong_sign", "undecided", "unresolvable",
+        "lack_of_fit", "force_drifts", "warnings",
     )  # fmt: skip
     optional = ("gain", "missing_force", "residual_force", "next_experiment", "model", "plan_hash")
     content = {
@@ -174,6 +179,7 @@ def refuse(faults: Sequence[Fault], motions: Sequence[str] = ()) -> Diagnosis:
         **dict.fromkeys(optional),
         "verdict": "invalid_data",
         "also_unexplained": False,
+        "single_motion": False,
         "parameters": {},
         "faults": [{"episode": f.episode, "what": f.what, "remedy": f.remedy} for f in faults],
         "motions": list(motions),

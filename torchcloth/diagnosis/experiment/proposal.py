@@ -104,6 +104,8 @@ def propose_experiment(
             return None  # an experiment that cannot be simulated says nothing
 
     choices = check_feasibility(data.recordings, progress)
+    if not result.has_held_out_motions:  # a repetition would leave a single motion
+        choices = [choice for choice in choices if str(choice.experiment) not in data.motions]
     refused = {str(c.experiment): c.why_not for c in choices if c.why_not is not None}
     answers = map_parallel(simulate, [c for c in choices if not c.why_not])
     simulated = [answer for answer in answers if answer is not None]
@@ -146,9 +148,12 @@ def _describe_arms(choice: FeasibleExperiment, refused: Mapping[str, str]) -> di
 def find_open_question(result: SearchResult, content: Mapping[str, Any]) -> OpenQuestion | None:
     """Return what a search leaves open: causes with rivals, else hypotheses that are not decided.
 
+    Of a single motion, it is which of the hypotheses that would explain it does.
+
     Args:
         result: the search.
-        content: descriptions of causes and of what is too small to be relevant, which may have relevant rivals.
+        content: descriptions of causes and of what is too small to be relevant, which may have relevant rivals; of a
+            single motion, the ranking ``in_sample``.
     """
     descriptions = [*content["causes"], *content["minor"]]
     parameters = {p.name for p in result.end.model.parameters}  # no experiment shows what equals one of them
@@ -170,10 +175,22 @@ def find_open_question(result: SearchResult, content: Mapping[str, Any]) -> Open
         return None
     hypotheses = result.end.linearisation.hypotheses
     known = {h.name for h in hypotheses if h.equivalent_parameter not in parameters}
+    explanations = [row for row in content.get("in_sample", ()) if row["effect"] in known]
+    if explanations:
+        return _distinguish_explanations(result, explanations)
     undecided = [s for s in result.scores if s.decision in ("present", "inconclusive") and s.hypothesis.name in known]
     undecided = undecided[: CRITERIA.proposal.max_undecided]
     amplitudes = {s.hypothesis.name: s.hypothesis.smallest_of_interest for s in undecided}
     return OpenQuestion(result.end, amplitudes) if amplitudes else None
+
+
+def _distinguish_explanations(result: SearchResult, rows: Sequence[Mapping[str, Any]]) -> OpenQuestion:
+    """Return which of the explanations of a single motion holds, or whether the only one does."""
+    rows = rows[: CRITERIA.proposal.max_undecided]
+    best, *others = (row["effect"] for row in rows)
+    same = next(h for h in result.end.linearisation.hypotheses if h.name == best).structurally_equivalent
+    pairs = tuple((best, other) for other in others if other not in same)
+    return OpenQuestion(result.end, {row["effect"]: row["amplitude"] for row in rows}, pairs)
 
 
 def compute_information(question: OpenQuestion, added: Sequence[Tensor]) -> Tensor:

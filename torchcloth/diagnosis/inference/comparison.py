@@ -110,6 +110,11 @@ def list_observed_motions(episode: Tensor, motions: Sequence[str]) -> list[str]:
     return [motion for k, motion in enumerate(motions) if k in observed]
 
 
+def has_held_out_motions(episode: Tensor, motions: Sequence[str]) -> bool:
+    """Check whether one motion can be held out while another one is fitted; arguments as ``list_observed_motions``."""
+    return len(set(list_observed_motions(episode, motions))) > 1
+
+
 def predict_held_out(fitted: ModelFit, motions: Sequence[str], halved: Collection[str] = ()) -> HeldOutPrediction:
     """Predict every episode while its motion is left out of the fit.
 

@@ -92,6 +92,7 @@ def _collect_evidence(answer: Diagnosis) -> dict[str, Any]:
         "causes": _tabulate_causes(content["causes"]) if content["causes"] else None,
         "overlays": overlays,
         "residual_maps": None if residual_maps is None else _encode_figure(residual_maps),
+        "is_single_motion": not result.has_held_out_motions,
         "held_out_rms": _encode_figure(pictures.draw_held_out_rms(answer, before, after if result.accepted else None)),
         "gain": None if content["gain"] is None else _tabulate_gain(content["gain"]),
         "start_scores": _encode_figure(pictures.draw_scores(start_scores)),

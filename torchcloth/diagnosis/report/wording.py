@@ -20,6 +20,11 @@ MILLIMETRES = (
     "Millimetres are means over parts of the fabric and 0.2 s, without small errors of clock, camera and grip. Single "
     "points are farther off."
 )
+SINGLE_MOTION = {
+    "adequate": "This holds for this motion only: others may show what it does not.",
+    "inconclusive": "One motion cannot confirm a cause, because no other one was held out to predict.",
+    "unexplained": "This holds for this motion only, by linearised tests.",
+}
 FELT_BLOCKS = BLOCK_NAMES[FORCE_BLOCK:]
 NO_MASS = (
     "No forces were measured, so the mass itself cannot be determined: cloth that is heavier, and as many times "
@@ -80,6 +85,9 @@ def write_sentences(verdict: str, content: dict[str, Any]) -> list[str]:
             "two simulators. For real cloth that may be more."
         )
     out += [VERDICTS[verdict]] if verdict in VERDICTS else []
+    if content.get("single_motion"):
+        out += [SINGLE_MOTION[verdict]] if verdict in SINGLE_MOTION else []
+        out += _describe_in_sample(content["in_sample"])
     out += [f"{f['episode']}: {f['what']}. To do: {f['remedy']}." for f in content.get("faults", ())]
     if content["also_unexplained"]:
         out.append("Something beyond these causes remains unexplained.")
@@ -149,6 +157,18 @@ def _describe_cause(c: dict[str, Any], content: dict[str, Any]) -> list[str]:
     rivals = {r["effect"]: f"{_amplitude(r)} in its place" for r in c["rivals"]}
     others = {name: name for name in c["equivalence_class"] if name != c["effect"]} | rivals
     out += [f"  Confounded with: {', '.join(others.values())}."] if others else []
+    return out
+
+
+def _describe_in_sample(rows: Sequence[dict[str, Any]]) -> list[str]:
+    """Return what would explain a single motion."""
+    if not rows:
+        return []
+    best, *others = rows
+    equal, worse = ([_amplitude(row) for row in others if row["explains_as_well"] is flag] for flag in (True, False))
+    out = [f"Fits best in sample: {_amplitude(best)}, linearised, {best['expected_gain']:.0f} in log density."]
+    out += [f"  It would be explained about equally well by {', or by '.join(equal)}."] if equal else []
+    out += [f"  In part by {', or by '.join(worse)}."] if worse else []
     return out
 
 
@@ -334,6 +354,8 @@ def describe_next_step(verdict: str, content: dict[str, Any]) -> str:
     if content.get("next_experiment"):
         motion = content["next_experiment"]["motion"]
         return f"record the proposed motion {motion!r} (folder next_experiment), and diagnose again with it."
+    if verdict == "adequate" and content.get("single_motion"):
+        return 'use the fitted model, tc.load("base.tcm"), or record another motion and diagnose both.'
     return {
         "identified": "measure the gain on new episodes with `torchcloth confirm base.tcm extended.tcm EPISODE`; "
         'tc.load("extended.tcm") is the corrected cloth.',
