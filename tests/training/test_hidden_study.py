@@ -60,7 +60,7 @@ def test_the_truth_is_opened_after_the_answer_and_nothing_is_told(called, tmp_pa
     hidden.run(options(tmp_path, dev=True, cases=2))
     kinds = [command[0] if command[0] != "-m" else command[2] for command in called]
     assert kinds == ["make_case", "diagnose", "reveal_truth"] * 2
-    assert called[1] == ["-m", "torchcloth.cli", "diagnose", "e1", "e2", "--out", "001"]
+    assert called[1] == ["-m", "torchcloth.cli", "diagnose", "e1", "e2", "--out", "001", "--no-checks"]
     resumable = json.loads((tmp_path / "s" / "cases" / "001.json").read_text())
     assert resumable["truth"]["family"] == "null"
     assert resumable["answer"] == ANSWER
@@ -274,7 +274,7 @@ def test_experiments_are_made_of_the_same_case_and_answered_with_all_episodes(ca
     answer = hidden.answer_after_experiments(tmp_path, "007", make, [tmp_path / "e1"], asked, 19)
     assert made[0] == ("--motion", "turn", "--heading", "95.0", "--out", str(tmp_path / "episodes" / "007-proposed"))
     assert made[1][0] == "--motion"
-    assert called[0][2:] == ["diagnose", "e1", "e9", "--out", "007-proposed"]
+    assert called[0][2:] == ["diagnose", "e1", "e9", "--out", "007-proposed", "--no-checks"]
     assert answer == {"proposed": ANSWER, "random": ANSWER}
     assert hidden.answer_after_experiments(tmp_path, "008", make, [], ANSWER, 19) == {"proposed": None, "random": None}
 

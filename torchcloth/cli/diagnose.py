@@ -12,6 +12,7 @@ from typing import Any
 from .._utils.files import PROGRESS_FOLDER_NAME
 from ..errors import InvalidInput
 from .output_paths import check_output_folder, check_outside_episodes, output_path, print_line, resume_hint
+from .recording_checks import add_checks_option
 
 LONG_EPISODE_S = 10.0  # longer episodes are announced, because their cost grows with the cube of the duration
 
@@ -29,6 +30,7 @@ def add(verbs: Any) -> None:
     parser.add_argument("--model", metavar="MODEL", help="a .tcm file to start from (default: A-EP in vacuum)")
     parser.add_argument("--out", type=output_path, required=True, metavar="DIR", help="folder for the result")
     parser.add_argument("--resume", action="store_true", help="resume a diagnosis that was stopped")
+    add_checks_option(parser)
     parser.set_defaults(run=_diagnose, stopped=resume_hint)
 
 
@@ -73,6 +75,7 @@ def _diagnose(options: argparse.Namespace) -> int:
                 progress=progress,
                 journal=options.out / PROGRESS_FOLDER_NAME,
                 resume=options.resume or None,
+                checks=options.checks,
             )
     written = diagnosis.write_diagnosis(answer, episodes, options.out)
     if answer.optional_search is not None:  # a stopped diagnosis goes on once the episodes can be read

@@ -22,6 +22,7 @@ from .output_paths import (
     replacement_note,
     resume_hint,
 )
+from .recording_checks import add_checks_option
 
 if TYPE_CHECKING:
     from ..cloth import Cloth
@@ -132,12 +133,7 @@ def _add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--profile", nargs="+", default=[], metavar="NAME", help="find the interval by profile likelihood"
     )
-    parser.add_argument(
-        "--checks",
-        action=argparse.BooleanOptionalAction,
-        default=True,
-        help="leave out frozen clouds, and correct a clock that is off (default: yes)",
-    )
+    add_checks_option(parser)
     parser.add_argument(
         "--refine",
         action=argparse.BooleanOptionalAction,

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 from ..errors import InvalidInput
 from .identify import describe_causes_outside_cloth, parse_assignments, parse_nuisances
 from .output_paths import check_output_folder, check_outside_episodes, output_path, print_line, replacement_note
+from .recording_checks import add_checks_option
 
 if TYPE_CHECKING:
     from ..cloth import Cloth
@@ -59,6 +60,7 @@ def add(verbs: Any) -> None:
         "--use", nargs="+", choices=["points", "markers", "force"], help="kinds of data to compare with (default: all)"
     )
     pose.add_argument("--dt", type=float, metavar="SECONDS", help="largest substep (default: the stable one)")
+    add_checks_option(pose)
     pose.add_argument("--truth", action="store_true", help="show the true cloth of a synthetic episode in the picture")
     pose.add_argument(
         "--out", type=output_path, required=True, metavar="DIR", help="folder for the result and the picture"
@@ -70,6 +72,7 @@ def _pose(options: argparse.Namespace) -> int:
     import torch
 
     from .. import recordings, viewing
+    from ..inspection.corrections import check_all
     from ..pose.tables import print_pose
 
     torch.set_default_dtype(torch.float64)
@@ -83,7 +86,8 @@ def _pose(options: argparse.Namespace) -> int:
     estimate = _estimate(options, cloth, uncertain, recording)
     note = replacement_note(options.out / "pose.json")
     files = estimate.save(options.out)
-    film = viewing.film_from_pose(recording, estimate, truth=options.truth)
+    shown = check_all([recording])[0][0] if options.checks else recording  # the clouds at the times that were used
+    film = viewing.film_from_pose(shown, estimate, truth=options.truth)
     picture = viewing.write_png(film, options.out / "pose.png", size=PANEL_SIZE_PX)
     print_pose(estimate)
     if options.fit is not None and _was_fitted_to(options.fit, recording):
@@ -156,4 +160,5 @@ def _estimate(
             use=options.use,
             dt=options.dt,
             on_progress=advance,
+            checks=options.checks,
         )

@@ -54,4 +54,4 @@ def _describe_problem(model: WorldModel, data: DiagnosisData) -> list[object]:
     cloth = cloth_fingerprint_parts(model.base.cloth)
     episodes = [part for e in data.episodes for part in (*e.fingerprint_parts(), *model.base.fingerprint_parts(e))]
     parameters = [(p.name, p.step, p.prior_std) for p in model.parameters]
-    return [data.dt, parameters, *digest_user_files(), *cloth, data.rest_positions, *episodes]
+    return [data.dt, data.clock_stds, parameters, *digest_user_files(), *cloth, data.rest_positions, *episodes]

@@ -15,6 +15,7 @@ from .._utils.torch_modes import isolated_grad_mode
 from ..episodes.cloth_fingerprint import cloth_fingerprint_parts
 from ..episodes.world import Hypothesis, WorldModel
 from ..errors import InvalidInput
+from ..inspection.corrections import check_recording
 from ..recordings import Recording
 from ..recordings.consistency import as_list, merge_scene
 from ..recordings.fingerprints import fingerprint, reject_duplicates
@@ -52,6 +53,7 @@ def diagnose(
     progress: Progress = lambda _: None,
     journal: Path | None = None,
     resume: bool | None = False,
+    checks: bool = True,
 ) -> Diagnosis:
     """Find what a simulation of episodes gets wrong, and what correcting it gains.
 
@@ -65,6 +67,9 @@ def diagnose(
         journal: folder for finished episodes, a few hundred kilobytes each; None: nothing is stored.
         resume: whether to continue with what a stopped diagnosis left there; the answer is the same bit by bit. None:
             start over, but refuse a folder where it could continue.
+        checks: look for frozen clouds and for a clock that is off, as ``identify`` does (``inspection.corrections``).
+            Frozen clouds are left out. A clock that is off is corrected, and the nuisance of that episode's clock gets
+            the error of the correction. The warnings say so.
 
     Raises:
         InvalidInput: no episodes, different cloths, one episode twice, a default dtype other than float64, a model with
@@ -92,6 +97,11 @@ def diagnose(
     if faults := check_episodes(recordings):
         return refuse(faults, motions)
     reject_duplicates(recordings)
+    originals, notes, clock_stds = recordings, [], ()
+    if checks:
+        checked = [check_recording(recording) for recording in recordings]
+        recordings, clock_stds = [c.recording for c in checked], tuple(c.clock_std for c in checked)
+        notes = [note for c in checked for note in c.notes]
 
     # 2. Model and hypotheses, and a fingerprint of everything that was decided before the first simulation.
     model = model or build_base_model(merge_scene(recordings))
@@ -100,7 +110,7 @@ def diagnose(
     plan_hash = _fingerprint_plan(model, asked, motions)
 
     # 3. Data on both meshes.
-    data = prepare_data(model, recordings)
+    data = replace(prepare_data(model, recordings), clock_stds=clock_stds)
     check_positions_observed(data)
     for mesh_data in (data, data.fine_mesh):
         if mesh_data is not None:
@@ -127,9 +137,9 @@ def diagnose(
         "plan_hash": plan_hash,
         "base": BASE_MODEL_FILE,
         "model": EXTENDED_MODEL_FILE,
-        "episodes": [fingerprint(r) for r in recordings],
+        "episodes": [fingerprint(r) for r in originals],
         "next_experiment": description,
-        "warnings": [*answer.content["warnings"], *([NO_EXPERIMENT_WARNING] if has_no_experiment else [])],
+        "warnings": [*notes, *answer.content["warnings"], *([NO_EXPERIMENT_WARNING] if has_no_experiment else [])],
     }
     return replace(answer, content=content, overlays=overlays, experiment=episode)
 

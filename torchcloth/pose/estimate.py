@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import torch
@@ -18,11 +19,12 @@ from ..cloth import Cloth
 from ..episodes.observed import TIME_AFTER_KNOT_S, Episode, build_episode, require_cpu
 from ..episodes.unknowns import apply_priors, collect_unknowns
 from ..errors import InvalidInput, RecordingError
-from ..identification.nuisances import add_lookahead, implied_nuisances, select_nuisances
+from ..identification.nuisances import add_lookahead, as_stds, implied_nuisances, select_nuisances
 from ..identification.residuals.blocks import select_blocks
 from ..identification.residuals.metrics import MIN_NOISE_SCALE, distance_metrics
 from ..identification.residuals.rigid_carry import carry_rigidly
 from ..identification.uncertainty.estimates import make_estimates, make_nuisance_estimates
+from ..inspection.corrections import check_all
 from ..recordings import Recording
 from ..recordings.consistency import check_recording
 from ..recordings.size_checks import check_size
@@ -52,6 +54,7 @@ def estimate_pose(
     noise: Mapping[str, float] | None = None,
     dt: float | None = None,
     on_progress: Progress | None = None,
+    checks: bool = True,
 ) -> PoseEstimate:
     """Estimate where every vertex of a cloth was at every frame of a recording, hidden ones included.
 
@@ -75,6 +78,8 @@ def estimate_pose(
         noise: least standard deviation by kind of data, as in ``identify``.
         dt: largest substep [s]; None: the stable one.
         on_progress: called with (stage, corrective force so far as a fraction of the weight).
+        checks: look for frozen clouds and for a clock that is off, as ``identify`` does (``inspection.corrections``).
+            The result has no frames where clouds were frozen. A clock that is off is corrected, and becomes a nuisance.
 
     Returns:
         Frames with standard errors, visibility, forces, warnings.
@@ -90,6 +95,10 @@ def estimate_pose(
     require_cpu(cloth)
     check_recording(recording)
     check_size(recording)
+    notes, nuisances = [], as_stds(nuisances)
+    if checks:
+        (recording,), notes, clock_std = check_all([recording])
+        nuisances = nuisances if clock_std is None else {"clock": clock_std, **nuisances}
     check_mode_count(cloth.mesh, modes)
     episode, all_modes = build_episode(cloth, recording), compute_modes(cloth.mesh)
     fields = all_modes.fields[:modes].to(episode.initial)
@@ -113,7 +122,8 @@ def estimate_pose(
         if on_progress is not None:
             on_progress(stage, _rms_over_time(objective, _force_fractions(objective, raw, is_always_gripped, gravity)))
 
-    return _assemble_result(objective, smooth(objective, report), all_modes, gravity, began)
+    estimate = _assemble_result(objective, smooth(objective, report), all_modes, gravity, began)
+    return replace(estimate, warnings=[*notes, *estimate.warnings])
 
 
 def _assemble_result(

@@ -237,6 +237,7 @@ def diagnose_episodes(episodes: list[Path], out: Path) -> dict[str, Any]:
     if (out / ANSWER_FILE).exists() and not begun:
         return json.loads((out / ANSWER_FILE).read_text())
     command = [sys.executable, "-m", "torchcloth.cli", "diagnose", *map(str, episodes), "--out", str(out)]
+    command.append("--no-checks")  # a clock that is off is one of the hidden effects
     done = _run([*command, "--resume"] if begun else command)
     if begun and done.returncode == REFUSED_EXIT_CODE:  # another version of the program wrote the journal
         shutil.rmtree(out / PROGRESS_FOLDER_NAME)

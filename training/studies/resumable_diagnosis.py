@@ -19,7 +19,7 @@ def diagnosis_in(
 ) -> Diagnosis:
     """Run a diagnosis or resume a stopped one, and write it to the folder; see ``diagnose`` for the arguments."""
     journal = folder / PROGRESS_FOLDER_NAME
-    answer = diagnose(recordings, model, hypotheses, journal=journal, resume=journal.exists())
+    answer = diagnose(recordings, model, hypotheses, journal=journal, resume=journal.exists(), checks=False)
     write_diagnosis(answer, recordings, folder)
     clear_store(journal)
     return answer

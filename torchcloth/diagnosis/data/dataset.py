@@ -67,6 +67,7 @@ class DiagnosisData:
         dt: substep of the simulations [s]; None: the largest stable one.
         fine_mesh: the same on a mesh twice as fine.
         bifurcating_bins: per episode, keys of bins with a discontinuous response; empty: not searched for yet.
+        clock_stds: prior standard deviation of each episode's clock where it was corrected [s]; else None.
         cache: stores finished episodes.
         recent_frames: the most recent simulations.
     """
@@ -79,6 +80,7 @@ class DiagnosisData:
     dt: float | None = None
     fine_mesh: DiagnosisData | None = None
     bifurcating_bins: tuple[Tensor, ...] = ()
+    clock_stds: tuple[float | None, ...] = ()
     cache: EpisodeCache = no_cache
     recent_frames: LRUCache[Frames] = field(default_factory=_frame_cache)
 

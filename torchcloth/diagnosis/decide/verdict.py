@@ -108,6 +108,8 @@ def judge(
     minor = [_describe_minor(result, cause) for cause in result.minor]
     mentioned = {name for m in minor for name in (m["effect"], *(r["effect"] for r in m["rivals"]))}
     mentioned |= {name for c in causes for name in (*c["equivalence_class"], *(r["effect"] for r in c["rivals"]))}
+    explanations = [explanation.as_dict() for explanation in rank_in_sample(result)]
+    mentioned |= {row["effect"] for row in explanations}
     scores = [score for score in result.scores if score.hypothesis.name not in mentioned]
 
     # the model lacks something if the residuals say so, if laws without a cause predict better, or if motions disagree
@@ -117,7 +119,6 @@ def judge(
     is_inadequate = is_inadequate or any(c["motions_disagree"] for c in causes)
 
     relevant_rivals = [r["effect"] for m in minor for r in m["rivals"]]
-    explanations = [explanation.as_dict() for explanation in rank_in_sample(result)]
     is_doubtful = bool(relevant_rivals or result.end.model.strained_parameters or explanations)
     meshes_agree = all(row.meshes_agree for row in rows)
     # a motion that could be explained is not unexplained, though nothing confirms the explanation

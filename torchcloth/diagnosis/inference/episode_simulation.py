@@ -59,6 +59,7 @@ def simulate_episode(
             simulated again.
     """
     e, world = data.episodes[k], worlds.base
+    clock_std = (data.clock_stds[k] if data.clock_stds else None) or CLOCK_STD_S
     fine_data: DiagnosisData = data.fine_mesh  # type: ignore[assignment]
     steps = [clip_step(worlds.model, coordinate, step) for coordinate, step in worlds.shifts]
     fine_episode = (fine_data.episodes[k], fine_data.dt)
@@ -67,7 +68,7 @@ def simulate_episode(
     shifted = [*zip(runs.shifted, steps, worlds.shifted_on_fine_mesh, strict=True), *_hypothesis_runs(hypotheses, runs)]
     slopes, fine_slopes = _differentiate(base, shifted, False), _differentiate(runs.fine, shifted, True)
     if known_nuisances is None:
-        along_nuisances, std = differentiate_nuisances(world, base, runs.grasp_shifted, e)
+        along_nuisances, std = differentiate_nuisances(world, base, runs.grasp_shifted, e, clock_std)
         slopes = along_nuisances if slopes is None else concatenate_directions(slopes, along_nuisances)
         coarse = bin_residuals(base, slopes, e, data.surface, data.rest_positions)
     else:
@@ -75,7 +76,7 @@ def simulate_episode(
         coarse = bin_residuals(base, slopes, e, data.surface, data.rest_positions)
         nuisance_columns, is_new = align_rows(coarse.key, key, nuisance_slopes), ~torch.isin(coarse.key, key)
         if bool(is_new.any()):  # bins that appear for the first time; slopes along grasps would need simulations
-            along_nuisances, _ = differentiate_nuisances(world, base, [], e)
+            along_nuisances, _ = differentiate_nuisances(world, base, [], e, clock_std)
             new = bin_residuals(base, along_nuisances, e, data.surface, data.rest_positions)
             nuisance_columns[is_new, : new.jacobian.shape[1]] = align_rows(coarse.key, new.key, new.jacobian)[is_new]
         coarse = coarse._replace(jacobian=torch.cat([coarse.jacobian, nuisance_columns], 1))
@@ -251,7 +252,7 @@ def _take_fine_values(coarse: BinnedResiduals, fine: BinnedResiduals) -> tuple[B
 
 
 def differentiate_nuisances(
-    world: World, base: Frames, grasp_shifted: Sequence[Frames], e: Episode
+    world: World, base: Frames, grasp_shifted: Sequence[Frames], e: Episode, clock_std: float = CLOCK_STD_S
 ) -> tuple[Frames, Tensor]:
     """Return the derivatives along the nuisances of an episode, and their standard deviations [N].
 
@@ -260,11 +261,12 @@ def differentiate_nuisances(
         base: the episode at the model's point.
         grasp_shifted: the episode with shifted grasps.
         e: the episode.
+        clock_std: prior standard deviation of its clock [s].
     """
     camera_stds = [CAMERA_SHIFT_STD_M] * 3 + [CAMERA_TURN_STD_RAD] * 3
     shifted, steps, stds = [], [], []
     for nuisance, known_stds in (
-        (ClockOffset(), [CLOCK_STD_S]), (CameraOffset(), camera_stds), (RimOffset(), [RIM_STD_M]), (ForceTare(), None)
+        (ClockOffset(), [clock_std]), (CameraOffset(), camera_stds), (RimOffset(), [RIM_STD_M]), (ForceTare(), None)
     ):  # fmt: skip
         parts = len(nuisance.number_names(world.cloth, e))
         for k in range(parts):

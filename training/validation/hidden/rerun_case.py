@@ -87,7 +87,7 @@ def main(arguments: list[str] | None = None) -> int:
     resume.source_fingerprint = lambda: (
         "any"
     )  # else every change of the library would invalidate the stored simulations
-    answer = diagnosis.diagnose(episodes, journal=journal, resume=journal.exists())
+    answer = diagnosis.diagnose(episodes, journal=journal, resume=journal.exists(), checks=False)
     model, std = answer.model, answer.search.end.covariance.diagonal().sqrt()
     for p, c, s in zip(model.parameters, model.coordinates.tolist(), std.tolist(), strict=False):
         pull = abs(c) / max(p.prior_std**2 - s**2, 1e-12) ** 0.5
