@@ -26,6 +26,7 @@ STUDY_NAMES: tuple[str, ...] = (
     "hidden",
     "screening",
     "fault_injection",
+    "honesty",
     "air",
 )
 
