@@ -98,15 +98,6 @@ def run_case(out: Path, seed: int, fast: bool, version: str, python: str) -> dic
         return {**case, "refused": message, "parameters": {}}
     keys = ("value", "std", "ci95", "identifiable")
     fitted = {name: {key: e[key] for key in keys} for name, e in fit["parameters"].items() if name in truth["truth"]}
-    numbers = (
-        "iterations",
-        "simulations",
-        "converged",
-        "rms_after",
-        "points_residual",
-        "points_misfit",
-        "points_noise",
-    )
     return {
         **case,
         "refused": "",
