@@ -166,10 +166,11 @@ def _matrix(origin: Any) -> Tensor:
 
 def _axis(joint: Any) -> Tensor:
     axis = torch.tensor(joint.axis or [1.0, 0.0, 0.0], dtype=torch.float64)
-    length = axis.norm()
-    if not length > 0:
+    largest = axis.abs().max()
+    if not largest > 0:
         raise InvalidInput(f"axis of joint {joint.name!r}", got=joint.axis, expected="a vector that is not zero")
-    return axis / length
+    axis = axis / largest  # the square of its length could overflow, or vanish
+    return axis / axis.norm()
 
 
 def _limits(joint: Any) -> tuple[float, ...]:

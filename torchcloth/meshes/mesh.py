@@ -260,12 +260,14 @@ def check_metres(vertices: np.ndarray, faces: np.ndarray, corners: np.ndarray | 
     unless by chance, so a pattern that fills the unit square must agree more closely.
 
     Raises:
-        InvalidInput: a span beyond MAX_CLOTH_SPAN_M, or a pattern whose edges have other lengths.
+        InvalidInput: no span, one beyond MAX_CLOTH_SPAN_M, or a pattern whose edges have other lengths.
     """
     span = float(np.ptp(vertices, axis=0).max())
     if span > MAX_CLOTH_SPAN_M:
         got, remedy = f"a span of {span:.4g}", "multiply by 0.001"
         raise InvalidInput(f"{place} looks like millimetres", got=got, expected="metres", remedy=remedy)
+    if not span > 0:
+        raise InvalidInput(f"{place} has no extent", got="all vertices in one place", expected="a cloth")
     if corners is None:
         return
     pattern, lying = (np.linalg.norm(c - np.roll(c, 1, axis=1), axis=-1).ravel() for c in (corners, vertices[faces]))

@@ -8,6 +8,7 @@ import numpy as np
 
 from ..errors import InvalidInput
 
+MAX_FINITE_COORDINATE = 1e100  # larger values count as infinite; squares of smaller ones stay finite
 VALUES_PER_LINE_KIND = {"v": 3, "vt": 2}  # more may follow on a line
 
 
@@ -22,6 +23,7 @@ def parse(text: str, place: str) -> tuple[np.ndarray, np.ndarray, np.ndarray | N
         InvalidInput: a damaged line, numbers that are not finite, no faces, a vertex in no face.
     """
     v, vt, corners = [], [], []
+    polygons: dict[int, list[int]] = {}  # vertices of faces with more than three corners, by line
     for number, line in enumerate(text.splitlines(), 1):
         word, *items = line.split("#")[0].split() or [""]
         try:
@@ -36,10 +38,8 @@ def parse(text: str, place: str) -> tuple[np.ndarray, np.ndarray, np.ndarray | N
                 if len(ring) < 3:
                     raise ValueError(f"{len(ring)} corners")
                 if len(ring) > 3:
-                    check_convex(np.array([[v[i] for i, _ in ring]]), f"{place}, line {number}")
+                    polygons[number] = [i for i, _ in ring]
                 corners += [(ring[0], *pair) for pair in pairwise(ring[1:])]
-        except InvalidInput:
-            raise
         except ValueError as error:
             raise InvalidInput(
                 f"{place} is damaged at line {number}",
@@ -47,6 +47,8 @@ def parse(text: str, place: str) -> tuple[np.ndarray, np.ndarray, np.ndarray | N
                 expected="v X Y Z, vt U V, or f with numbers of three vertices or more",
             ) from error
     vertices = _rows(v, f"{place}: v", 3)
+    for number, ring in polygons.items():
+        check_convex(vertices[ring][None], f"{place}, line {number}")
     index = _rows(corners, f"{place}: f", 3, 2).astype(np.int64)
     faces, patches = index[..., 0], index[..., 1]
     unused = np.setdiff1d(np.arange(len(vertices)), faces)
@@ -67,9 +69,13 @@ def check_convex(polygons: np.ndarray, place: str) -> None:
     """Check that a fan of triangles covers each of the polygons [N, K, 3] once.
 
     Raises:
-        InvalidInput: one is not convex, or folded onto itself.
+        InvalidInput: one is not convex, or folded onto itself, or has coordinates that are not finite.
     """
-    edges = polygons[:, 1:] - polygons[:, :1]
+    if not (np.abs(polygons) < MAX_FINITE_COORDINATE).all():
+        raise InvalidInput(f"{place} is not finite", expected="numbers", remedy="drop or repair that polygon")
+    edges = polygons[:, 1:] - polygons[:, :1].astype(float)
+    size = np.abs(edges).max(axis=(1, 2), keepdims=True)
+    edges = edges / np.maximum(size, np.finfo(float).tiny)  # the fourth powers of lengths below could overflow
     twice = np.cross(edges[:, :-1], edges[:, 1:])
     bent = (twice * twice.sum(1, keepdims=True)).sum(-1) < -1e-9 * (twice**2).sum((-2, -1))[:, None]
     if (bent := bent.any(1)).any():
@@ -112,6 +118,6 @@ def _rows(rows: list, place: str, *shape: int) -> np.ndarray:
     if data.shape[1:] != shape:
         expected = f"[{', '.join(map(str, ('N', *shape)))}]"
         raise InvalidInput(f"{place} has the wrong shape", got=list(data.shape), expected=expected)
-    if not (np.abs(data) < 1e100).all():
+    if not (np.abs(data) < MAX_FINITE_COORDINATE).all():
         raise InvalidInput(f"{place} is not finite", expected="numbers", remedy="drop or repair that line")
     return data

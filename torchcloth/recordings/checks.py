@@ -64,6 +64,8 @@ def check_array(
         raise RecordingError(
             f"{place} has the wrong dtype", got=data.dtype, expected=kind, remedy="convert and rewrite it"
         )
+    if kind != "bool" and isinstance(value, list) and _has_bool(value):  # numpy would count true as 1
+        raise RecordingError(f"{place} has the wrong dtype", got="true or false among numbers", expected=kind)
     if data.ndim != len(shape) or any(isinstance(n, int) and n != m for n, m in zip(shape, data.shape, strict=True)):
         raise RecordingError(
             f"{place} has the wrong shape", got=list(data.shape), expected=f"[{', '.join(map(str, shape))}]"
@@ -80,6 +82,11 @@ def check_array(
             remedy="drop or repair that sample",
         )
     return data
+
+
+def _has_bool(values: list) -> bool:
+    """Whether a nested list of JSON has true or false in it."""
+    return any(_has_bool(value) if isinstance(value, list) else isinstance(value, bool) for value in values)
 
 
 def check_increasing(t: np.ndarray, place: str) -> None:

@@ -17,7 +17,7 @@ from torchcloth.identification.estimators.objective import Objective
 from torchcloth.identification.residuals.rows import SimulatedEpisode, match_points
 from torchcloth.parameters import call_with_parameters
 
-from .checkpoints import read_checkpoint
+from .checkpoints import read_checkpoint, report_damage
 from .cloth_description import build_described_cloth, default_precision
 from .config import from_dict
 from .data import Episodes
@@ -66,7 +66,8 @@ class FitModule(pl.LightningModule):
             InvalidInput: the file holds other objects, or names a network that is not imported.
         """
         read_checkpoint(checkpoint_path)
-        return super().load_from_checkpoint(checkpoint_path, *args, **kwargs)
+        with report_damage(checkpoint_path):
+            return super().load_from_checkpoint(checkpoint_path, *args, **kwargs)
 
     def now(self) -> dict[str, float]:
         """Return the present values by name; of a field, its mean."""

@@ -100,7 +100,8 @@ class Bag:
                 place = f"{self.path}: {connection.topic}[{seen[connection.topic]}]"
                 deserialize = self._store.deserialize_ros1 if self.is_ros1 else self._store.deserialize_cdr
                 body = deserialize(raw, connection.msgtype)
-            yield BagMessage(connection.topic, int(logged), body, place)
+                bag_message = BagMessage(connection.topic, int(logged), body, place)
+            yield bag_message
 
     def _report_damage(self) -> AbstractContextManager[None]:
         if self.is_ros1:

@@ -33,7 +33,7 @@ from typing import Any
 from ...errors import RecordingError
 from . import embedded
 from .bag import Bag, is_bag
-from .imported import Imported, Importer, reject_unknown_keys
+from .imported import Imported, Importer, reject_unknown_keys, report_damage
 from .ros2_cameras import CameraTopics
 from .ros2_topics import CloudTopic, MotionTopics
 from .scene_file import SceneFile
@@ -107,7 +107,8 @@ def _distribute_messages(bag: Bag, parts: list[Any]) -> None:
             takers[topic].append(part)
     for message in bag.messages(list(takers)):
         for part in takers[message.topic]:
-            part.take(message)
+            with report_damage(message.place, f"message of type {bag.types[message.topic]}"):  # a bag defines its types
+                part.take(message)
 
 
 ROS2_IMPORTER = Importer(ROS2_NAME, ROS2_TITLE, matches, read)

@@ -1,0 +1,7 @@
+"""``python -m torchcloth.training.validation.fuzz``."""
+
+import sys
+
+from .command import main
+
+sys.exit(main())
