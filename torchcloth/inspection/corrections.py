@@ -12,8 +12,9 @@ import numpy as np
 
 from ..errors import TorchclothError
 from ..recordings import PointClouds, Recording
-from ..robots.paths import holding_paths  # pyright: ignore[reportMissingImports] - mapped from robots/ at installation
+from ..robots.paths import GripperPath, holding_paths  # pyright: ignore[reportMissingImports] - mapped from robots/
 from .lag import estimate_lag
+from .patch_noise import check_stated_noise
 
 MIN_CLOCK_PRIOR_STD_S = 0.01  # of a clock that was set by the estimated lag
 
@@ -33,28 +34,38 @@ class CheckedRecording(NamedTuple):
 
 
 def check_recording(recording: Recording) -> CheckedRecording:
-    """Check for frozen clouds and for a clock that is off, and mend both.
+    """Check for frozen clouds and for a clock that is off, and mend both; name a stated noise that is far off.
 
     Args:
         recording: an episode.
     """
     name = recording.path.name if recording.path else "recording"
     recording, notes = _leave_out_frozen_clouds(name, recording)
+    recording, paths, clock_notes, clock_std = _correct_clock(name, recording)
+    stated = check_stated_noise(recording, paths)
+    notes += [*clock_notes, *([] if stated is None else [f"{name}: {stated}"])]
+    return CheckedRecording(recording, notes, clock_std)
+
+
+def _correct_clock(
+    name: str, recording: Recording
+) -> tuple[Recording, dict[str, GripperPath], list[str], float | None]:
+    """Return the recording with a clock that is right, the paths of its grippers, notes, and the clock's error [s]."""
     try:
         paths = holding_paths(recording)
         lag = estimate_lag(recording, paths)
     except TorchclothError:  # no paths, so no lag; whoever needs them says so
         paths, lag = {}, None
     if lag is None or not lag.differs_from_recorded:
-        return CheckedRecording(recording, notes, None)
-    notes.append(
+        return recording, paths, [], None
+    note = (
         f"{name}: the observations come {1e3 * lag.value:.0f} ± {1e3 * lag.std:.0f} ms after the motion, and the "
         f"recording says {1e3 * lag.recorded:.0f} ms: the clock was corrected, and its error is fitted"
     )
     # the motion must cover the first frame; what is left is for the fit
     offset = max(-lag.value, max(path.t[0] for path in paths.values()) - _first_frame_time(recording))
     std = math.hypot(max(lag.std, MIN_CLOCK_PRIOR_STD_S), offset + lag.value)
-    return CheckedRecording(replace(recording, clock_offset=offset), notes, std)
+    return replace(recording, clock_offset=offset), paths, [note], std
 
 
 def _first_frame_time(recording: Recording) -> float:

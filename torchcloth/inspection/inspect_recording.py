@@ -13,15 +13,25 @@ from ..recordings.timing import StreamTiming
 from ..robots.paths import GripperPath, gripper_paths, holding_paths  # pyright: ignore[reportMissingImports] - mapped from robots/
 from . import depth_images, frame_checks, noise
 from .arm_views import describe_unmodelled_arms
+from .corrections import find_frozen_clouds
 from .depth_images import DepthSummary
 from .frame_checks import FrameChecks
 from .lag import LAG_CAVEAT, LagEstimate, estimate_lag
 from .noise import NoiseEstimate
+from .patch_noise import (
+    PatchNoise,
+    describe_stated_noise,
+    estimate_patch_noise,
+    gripper_positions,
+    standing_frames,
+)
 
 CONVENTION = (
     "SI units. Times are on each stream's own clock. lag: observation stamps minus motion stamps of one event (the "
     "recording's clock_offset should be minus the lag); std: by jackknife over blocks of time. noise: one standard "
-    "deviation of a coordinate. rejected: frames whose lengths differ from the cloth's by more than 10 %, "
+    "deviation of a coordinate, independent from point to point. patch_noise: what neighbouring points share besides, "
+    "as far as it changes from frame to frame. frozen_clouds: frames whose cloud equals the one before bit for bit. "
+    "rejected: frames whose lengths differ from the cloth's by more than 10 %, "
     "and clouds of less than a tenth of the median number of points. coverage: "
     "fraction of the markers seen, or area seen divided by the cloth's area (to about 20 %, so it may exceed 1; both "
     "sides of a fold count, a hidden side does not)."
@@ -39,6 +49,8 @@ class Inspection:
         paths: of the grippers, by name.
         lag: of the observations behind the motion; None if either is missing.
         noise: of "points" and "markers", if present.
+        patch_noise: the part of the points' noise that neighbouring points share; None without points.
+        frozen: [K] indices of clouds that equal the one before bit for bit.
         frames: checks of "points" and "markers", if present.
         depth: summary of each camera with depth images.
         notes: what could not be done, and what to mistrust.
@@ -49,6 +61,8 @@ class Inspection:
     paths: dict[str, GripperPath] = field(repr=False)
     lag: LagEstimate | None
     noise: dict[str, NoiseEstimate]
+    patch_noise: PatchNoise | None
+    frozen: list[int]
     frames: dict[str, FrameChecks]
     depth: dict[str, DepthSummary]
     notes: list[str]
@@ -65,6 +79,8 @@ class Inspection:
             "streams": {name: asdict(s) for name, s in self.streams.items()},
             "lag": lag,
             "noise": {name: asdict(n) for name, n in self.noise.items()},
+            "patch_noise": None if self.patch_noise is None else asdict(self.patch_noise),
+            "frozen_clouds": self.frozen,
             "frames": {name: _frames(f) for name, f in self.frames.items()},
             "depth": {name: asdict(d) for name, d in self.depth.items()},
             "convention": CONVENTION,
@@ -94,7 +110,7 @@ def inspect(recording: Recording) -> Inspection:
     if recording.markers is not None:
         checks["markers"] = frame_checks.check_marker_frames(recording.markers, recording.cloth)
     if recording.points is not None:
-        positions = _gripper_positions(recording.points.t + recording.clock_offset, holding)
+        positions = gripper_positions(holding, recording.points.t + recording.clock_offset)
         checks["points"], cloud_notes = frame_checks.check_cloud_frames(recording.points, recording.cloth, positions)
         notes += cloud_notes
     lag = estimate_lag(recording, holding, {name: ~check.rejected for name, check in checks.items()})
@@ -107,12 +123,18 @@ def inspect(recording: Recording) -> Inspection:
         except MissingDependency as error:
             notes.append(f"{name}: {error}")
     notes += describe_unmodelled_arms(recording)
+    is_frozen = np.zeros(0, bool) if recording.points is None else find_frozen_clouds(recording.points)
+    estimates, patch_noise = _estimate_noise(recording, holding, checks, shift, is_frozen)
+    stated = describe_stated_noise(recording.observation_noise_std, estimates.get("points"), patch_noise)
+    notes += [] if stated is None else [stated]
     return Inspection(
         recording,
         {name: timing.summarise_timing(kind, t) for name, (kind, t) in timing.stream_times(recording).items()},
         paths,
         lag,
-        _estimate_noise(recording, holding, checks, shift),
+        estimates,
+        patch_noise,
+        np.flatnonzero(is_frozen).tolist(),
         checks,
         depth,
         notes + _advice(recording, holding, lag),
@@ -130,25 +152,23 @@ def _all_paths(recording: Recording, holding: dict[str, GripperPath]) -> tuple[d
     return paths, notes
 
 
-def _gripper_positions(t: np.ndarray, holding: dict[str, GripperPath]) -> np.ndarray:
-    """Return [T, G, 3] m, the positions of the holding grippers at times [T] s on the motion clock."""
-    return np.stack([path.at(t)[0] for path in holding.values()], 1) if holding else np.zeros((len(t), 0, 3))
-
-
 def _estimate_noise(
-    recording: Recording, holding: dict[str, GripperPath], checks: dict[str, FrameChecks], shift: float
-) -> dict[str, NoiseEstimate]:
-    def is_still(t: np.ndarray) -> np.ndarray:
-        if not holding:
-            return np.zeros(len(t), bool)
-        return np.all([path.is_standing(t - shift) for path in holding.values()], axis=0)
-
-    estimates = {}
+    recording: Recording,
+    holding: dict[str, GripperPath],
+    checks: dict[str, FrameChecks],
+    shift: float,
+    is_frozen: np.ndarray,
+) -> tuple[dict[str, NoiseEstimate], PatchNoise | None]:
+    estimates, patch_noise = {}, None
     if (markers := recording.markers) is not None:
-        estimates["markers"] = noise.estimate_marker_noise(markers, is_still(markers.t), ~checks["markers"].rejected)
+        estimates["markers"] = noise.estimate_marker_noise(
+            markers, standing_frames(holding, markers.t - shift), ~checks["markers"].rejected
+        )
     if (points := recording.points) is not None:
-        estimates["points"] = noise.estimate_cloud_noise(points, is_still(points.t) if holding else None)
-    return {name: value for name, value in estimates.items() if value is not None}
+        still, positions = standing_frames(holding, points.t - shift), gripper_positions(holding, points.t - shift)
+        estimates["points"] = noise.estimate_cloud_noise(points, still if holding else None)
+        patch_noise = estimate_patch_noise(points, still & ~is_frozen, positions)
+    return {name: value for name, value in estimates.items() if value is not None}, patch_noise
 
 
 def _advice(recording: Recording, holding: dict[str, GripperPath], lag: LagEstimate | None) -> list[str]:

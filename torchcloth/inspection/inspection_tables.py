@@ -66,6 +66,13 @@ def _findings(console: Any, report: Inspection) -> None:
     for name, n in report.noise.items():
         axes = "" if n.std_xyz is None else "x y z " + " ".join(f"{1e3 * a:.1f}" for a in n.std_xyz) + " mm; "
         _add_row(table, f"noise, {name}", f"{1e3 * n.std:.2f} mm", f"{axes}{n.frames} frames, {n.method}")
+    if (patch := report.patch_noise) is not None:
+        value = "–" if patch.std is None else f"{1e3 * patch.std:.2f} mm"
+        frames = f"{patch.frames} frames, " if patch.frames else ""
+        _add_row(table, "noise shared by neighbours", value, f"{frames}{patch.method}")
+    if report.frozen:
+        detail = "clouds equal the one before bit for bit: the camera was frozen"
+        _add_row(table, "frozen clouds", f"{len(report.frozen)}", f"of {report.streams['points'].frames} {detail}")
     for name, checks in report.frames.items():
         _add_frame_rows(table, name, checks, report)
     for name, d in report.depth.items():

@@ -13,6 +13,7 @@ MIN_STILL_FRAMES = 6  # in a run
 MAX_SCATTER_TO_STEP_RATIO = 2.0  # scatter of coordinates over scatter of steps (1 for white noise) of cloth at rest
 MAX_SCATTER_TO_QUIETEST_RATIO = 1.5  # scatter over that of the quietest run, of cloth at rest
 PATCH_POINTS = 20  # of a local surface
+MAX_GROWTH_WITH_PATCH = 1.25  # of the scatter if patches have twice the area, where wrinkles are no part of it
 QUADRIC_COEFFICIENTS = 6
 MAX_PATCHES, MAX_NOISE_FRAMES, MAX_CLOUD_POINTS = 200, 20, 20_000  # per frame, in all, among which neighbours are found
 MAD_TO_STD = 1.4826  # standard deviation over median absolute deviation of a normal distribution
@@ -27,12 +28,15 @@ class NoiseEstimate:
         std_xyz: [m], along x, y and z for markers; None for clouds.
         frames: number of frames that were used.
         method: how it was measured.
+        is_resolved: whether the surface is smooth over a patch, so that wrinkles are no part of the noise: twice the
+            area gives about the same.
     """
 
     std: float
     std_xyz: tuple[float, float, float] | None
     frames: int
     method: str
+    is_resolved: bool = True
 
 
 def estimate_marker_noise(markers: Markers, still: np.ndarray, use: np.ndarray) -> NoiseEstimate | None:
@@ -49,7 +53,7 @@ def estimate_marker_noise(markers: Markers, still: np.ndarray, use: np.ndarray) 
     Returns:
         The median over the markers; None if it cannot be measured.
     """
-    runs = [markers.xyz[run][use[run]] for run in _still_runs(still)]
+    runs = [markers.xyz[run][use[run]] for run in still_runs(still)]
     runs = [xyz - nan_median(xyz, 0) for xyz in runs if len(xyz) >= MIN_STILL_FRAMES]
     runs = [xyz for xyz in runs if np.isfinite([_scatter(xyz), _scatter(np.diff(xyz, axis=0))]).all()]
     if not runs:
@@ -92,9 +96,17 @@ def estimate_cloud_noise(clouds: PointClouds, still: np.ndarray | None) -> Noise
     if len(frames) == 0:
         return None
     frames = frames[np.unique(np.linspace(0, len(frames) - 1, MAX_NOISE_FRAMES).astype(int))]
-    residual = np.concatenate([_off_surface(clouds.frame(int(i))) for i in frames])
-    std = MAD_TO_STD * float(np.median(np.abs(residual)))
-    return NoiseEstimate(std, None, len(frames), f"off local surfaces of {PATCH_POINTS} points, {frames_text}")
+    selected = [clouds.frame(int(i)) for i in frames]
+    std = _scatter_off_surface(selected)
+    thinned = [cloud[::2] for cloud in selected if len(cloud) >= 4 * PATCH_POINTS]
+    is_resolved = bool(thinned) and _scatter_off_surface(thinned) < MAX_GROWTH_WITH_PATCH * std
+    method = f"off local surfaces of {PATCH_POINTS} points, {frames_text}"
+    return NoiseEstimate(std, None, len(frames), method, is_resolved)
+
+
+def _scatter_off_surface(selected: list[np.ndarray]) -> float:
+    """Return the robust standard deviation [m] of points off local surfaces."""
+    return MAD_TO_STD * float(np.median(np.abs(np.concatenate([_off_surface(cloud) for cloud in selected]))))
 
 
 def _off_surface(cloud: np.ndarray) -> np.ndarray:
@@ -104,13 +116,21 @@ def _off_surface(cloud: np.ndarray) -> np.ndarray:
     squared_distance = ((centre[:, None] - cloud) ** 2).sum(-1)
     patch = cloud[np.argpartition(squared_distance, PATCH_POINTS - 1, axis=1)[:, :PATCH_POINTS]]
     patch = patch - patch.mean(1, keepdims=True)
-    axes = np.linalg.svd(patch, full_matrices=False)[2]
-    u, v, w = np.moveaxis(np.einsum("nkj,nij->nki", patch, axes), -1, 0)
+    u, v, w = np.moveaxis(np.einsum("nkj,nij->nki", patch, principal_axes(patch)), -1, 0)
+    return (subtract_quadrics(u, v, w) * np.sqrt(PATCH_POINTS / (PATCH_POINTS - QUADRIC_COEFFICIENTS))).ravel()
+
+
+def principal_axes(patch: np.ndarray) -> np.ndarray:
+    """Return [P, 3, 3] the principal axes of centred patches [P, N, 3] m as rows; the last is the normal."""
+    return np.linalg.svd(patch, full_matrices=False)[2]
+
+
+def subtract_quadrics(u: np.ndarray, v: np.ndarray, w: np.ndarray) -> np.ndarray:
+    """Return w [P, N] m less the quadrics in u and v [P, N] m that fit it best."""
     basis = np.stack([np.ones_like(u), u, v, u * u, u * v, v * v], -1)
     size = np.linalg.norm(basis, axis=1, keepdims=True)
     q, _ = np.linalg.qr(basis / np.where(size > 0, size, 1))
-    residual = w - np.einsum("nki,nji,nj->nk", q, q, w)
-    return (residual * np.sqrt(PATCH_POINTS / (PATCH_POINTS - QUADRIC_COEFFICIENTS))).ravel()
+    return w - np.einsum("nki,nji,nj->nk", q, q, w, optimize=True)
 
 
 def _scatter(deviation: np.ndarray) -> np.ndarray:
@@ -129,7 +149,11 @@ def _noisiest_direction(deviation: np.ndarray) -> np.ndarray:
     return np.linalg.eigh(seen.T @ seen)[1][:, -1]
 
 
-def _still_runs(still: np.ndarray) -> list[slice]:
-    """Return the runs of still frames."""
+def still_runs(still: np.ndarray) -> list[slice]:
+    """Return the runs of still frames.
+
+    Args:
+        still: [T] bool.
+    """
     edges = np.flatnonzero(np.diff(np.concatenate([[False], still, [False]]).astype(int)))
     return [slice(a, b) for a, b in zip(edges[::2], edges[1::2], strict=True)]
