@@ -134,6 +134,13 @@ def test_a_urdf_reads_no_other_file(write, tmp_path):
     refuse(write(text=text), "not a URDF file that can be read; got Entity 's' not defined")
 
 
+def test_entities_of_entities_are_refused(write):
+    """Ten lines that stand for a billion words."""
+    entities = '<!ENTITY e0 "lol">' + "".join(f'<!ENTITY e{i} "{f"&e{i - 1};" * 10}">' for i in range(1, 10))
+    text = f"<!DOCTYPE robot [{entities}]>" + ARM.replace('"0 0 0.1"', '"&e9;"')
+    refuse(write(text=text), "not a URDF file that can be read; got .*entity")
+
+
 def test_an_entity_of_the_file_itself_is_resolved(write):
     text = '<!DOCTYPE robot [<!ENTITY height "0.1">]>' + ARM.replace('"0 0 0.1"', '"0 0 &height;"')
     assert robots.load(write(text=text), frame="tip").joint_names == ("turn",)

@@ -19,6 +19,7 @@ MAX_PATTERN_EDGE_RATIO = 1.2
 MAX_UNIT_SQUARE_EDGE_RATIO = 1.05  # of a pattern that fills the unit square, and so may be a texture
 IGNORED_EDGE_FRACTION = 0.1  # at each end of these ratios: edges that are gathered or stretched where the cloth lies
 MAX_FLATNESS_RATIO = 20.0  # median height of the triangles over the smallest; ours have 1.6
+MIN_CLOTH_SPAN_M = 1e-9  # less is none: ratios of lengths could overflow
 MAX_CLOTH_SPAN_M = 20.0  # a longer cloth is taken to be in millimetres
 MAX_AREAL_DENSITY_KG_PER_M2 = 20.0  # a heavier cloth is taken to be in g/m^2
 
@@ -266,8 +267,8 @@ def check_metres(vertices: np.ndarray, faces: np.ndarray, corners: np.ndarray | 
     if span > MAX_CLOTH_SPAN_M:
         got, remedy = f"a span of {span:.4g}", "multiply by 0.001"
         raise InvalidInput(f"{place} looks like millimetres", got=got, expected="metres", remedy=remedy)
-    if not span > 0:
-        raise InvalidInput(f"{place} has no extent", got="all vertices in one place", expected="a cloth")
+    if not span > MIN_CLOTH_SPAN_M:
+        raise InvalidInput(f"{place} has no extent", got=f"a span of {span:.4g} m", expected="a cloth")
     if corners is None:
         return
     pattern, lying = (np.linalg.norm(c - np.roll(c, 1, axis=1), axis=-1).ravel() for c in (corners, vertices[faces]))

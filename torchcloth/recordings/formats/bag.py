@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 from ...errors import MissingDependency, RecordingError
 from ..files import is_present
 from . import mcap_checksums
+from .bounded_decompression import limit_rosbags
 from .imported import report_damage
 
 SQLITE_SIGNATURE = b"SQLite format 3\x00"
@@ -128,6 +129,7 @@ class Bag:
         except ImportError as error:
             message = "reading ROS bags needs rosbags"
             raise MissingDependency(message, remedy='pip install "torchcloth[data]"') from error
+        limit_rosbags()
         with (
             self._report_damage(),
             AnyReader([self.path], default_typestore=get_typestore(Stores.ROS2_HUMBLE)) as reader,

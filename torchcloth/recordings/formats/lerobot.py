@@ -19,11 +19,13 @@ decode to another picture are not detected, for AV1 and H.264 carry no checksum.
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from ..._utils.unpacking import check_unpacked_size
 from ...errors import MissingDependency, RecordingError
 from .. import checks
 from ..checks import Fields
@@ -36,9 +38,11 @@ from .video import VideoFrames
 LEROBOT_NAME = "lerobot"
 LEROBOT_TITLE = "LeRobot v3 data set"
 INFO_FILE = "meta/info.json"
+PATH_TEMPLATE_PATTERN = re.compile(r"([^{}]|\{\w+(:\d{0,2}d?)?\})*")  # a wider field could fill the memory
 LEROBOT_SOURCE_EXAMPLE = (
     '"source": {"motion": {"left": {"column": "observation.state", "joints": [0, 1, 2], "unit": "rad"}}}'
 )
+PARQUET_VALUE_BYTES = 8  # of a number; equal ones may take no space in the file
 LEROBOT_UNCHECKED = "pixels"
 LEROBOT_TIME_TOLERANCE_S = 1e-4  # LeRobot's own for video and row times
 MAX_JITTER_FRACTION = 0.9  # of the clock's interval, by which an interval of the hardware may differ
@@ -110,6 +114,10 @@ def _read_table(file: Path, *, columns: list[str] | None = None, episode: int | 
     if not is_present(file):
         raise RecordingError(f"{file} is missing", expected="a parquet file", remedy="download it")
     with report_damage(file, "parquet file"):
+        parts = parquet.read_metadata(file)
+        groups = map(parts.row_group, range(parts.num_row_groups))
+        values = sum(group.column(i).num_values for group in groups for i in range(parts.num_columns))
+        check_unpacked_size(values * PARQUET_VALUE_BYTES, file.stat().st_size, str(file))
         rows = None if episode is None else [("episode_index", "=", episode)]
         table = parquet.read_table(file, columns=columns, filters=rows, page_checksum_verification=True)
         table.validate(full=True)
@@ -300,6 +308,9 @@ def _file(info: Fields, key: str, row: dict[str, Any], group: str, **names: str)
     """Path from its template in info.json."""
     template = str(info.remaining.get(key, ""))
     numbers = {n: _whole(row, f"{group}/{n}") for n in ("chunk_index", "file_index")}
+    if not PATH_TEMPLATE_PATTERN.fullmatch(template):
+        expected = "a path with fields such as {chunk_index:03d}"
+        raise RecordingError(f"{info.location(key)} is no path template", got=repr(template), expected=expected)
     with report_damage(info.location(key), "path template"):
         path = template.format(**numbers, **names)
     if not path or Path(path).is_absolute() or ".." in Path(path).parts:

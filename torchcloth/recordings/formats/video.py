@@ -19,6 +19,8 @@ from ..images import ImageKind, ImageSource
 from .imported import report_damage
 
 STRICT_DECODER_OPTIONS = {"err_detect": "crccheck+bitstream+buffer+explode"}
+# No playlists, which name other files and addresses; FFmpeg tells a container by its content, not by its name.
+CONTAINER_OPTIONS = {"format_whitelist": "mov,mp4,m4a,3gp,3g2,mj2,matroska,webm", "protocol_whitelist": "file"}
 MIN_SEEK_TIME_NS = 2 * 10**9  # before this, decoding from the start is as fast
 PIXEL_FORMATS = {"depth": "gray16le", "color": "rgb24", "mask": "gray"}
 
@@ -96,7 +98,7 @@ def open_video(path: Path) -> Iterator[Any]:
     except ImportError as error:
         raise MissingDependency("reading video needs PyAV", remedy='pip install "torchcloth[data]"') from error
     with report_damage(path, "video"):
-        container = av.open(str(path))
+        container = av.open(str(path), container_options=CONTAINER_OPTIONS)
     try:
         yield container
     finally:
