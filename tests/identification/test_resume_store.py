@@ -51,6 +51,25 @@ def test_a_damaged_answer_is_computed_anew(tmp_path, damage):
     assert again.reused_count == 0
 
 
+class Touch:
+    """Makes a file when it is unpickled."""
+
+    def __init__(self, path):
+        self.path = path
+
+    def __reduce__(self):
+        return Path.touch, (self.path,)
+
+
+def test_an_answer_runs_no_code(tmp_path):
+    ResumableStore(tmp_path / "j", ["a"], resume=False).get_or_compute("rows", POINT, answer(1.0))
+    (file,) = (tmp_path / "j").glob("*.pt")
+    torch.save((Touch(tmp_path / "called"),), file)
+    again = ResumableStore(tmp_path / "j", ["a"], resume=True)
+    assert float(again.get_or_compute("rows", POINT, answer(2.0))[0]) == 2.0
+    assert not (tmp_path / "called").exists()
+
+
 def test_another_problem_is_refused(tmp_path):
     ResumableStore(tmp_path / "j", ["a", torch.zeros(3)], resume=False).get_or_compute("rows", POINT, answer(1.0))
     ResumableStore(tmp_path / "j", ["a", torch.zeros(3)], resume=True)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 import shutil
+import time
 
 import numpy as np
 import pytest
@@ -393,6 +394,16 @@ def test_paths(episode, tmp_path):
     (episode / "points.npz").unlink()
     (episode / "points.npz").mkdir()
     refused(episode, "points.npz cannot be read; got Is a directory")
+
+
+def test_a_key_that_is_repeated_among_many_is_named_at_once(episode):
+    """The search for it once took the square of their number: hours for a file of 10 MB."""
+    keys = ", ".join(f'"key{i}": 0' for i in range(200_000))
+    (episode / "episode.json").write_text(f'{{{keys}, "key199999": 1}}')
+    started = time.monotonic()
+    with pytest.raises(RecordingError, match="'key199999' twice in an object"):
+        rec.read(episode)
+    assert time.monotonic() - started < 10
 
 
 def test_initial_vertices_of_another_mesh(episode):

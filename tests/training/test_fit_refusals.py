@@ -121,6 +121,15 @@ def test_a_file_that_is_no_config(tmp_path, capsys, content):
     assert [f.name for f in tmp_path.iterdir()] in ([], ["config.yaml"])
 
 
+def test_a_config_runs_no_code(tmp_path, capsys):
+    """YAML can name functions to call, unless it is loaded safely."""
+    path = tmp_path / "config.yaml"
+    path.write_text(f"out: !!python/object/apply:os.mkdir ['{tmp_path / 'called'}']\n")
+    assert main(["--config", str(path)]) == 2
+    assert capsys.readouterr().err.count("\n") == 1
+    assert not (tmp_path / "called").exists()
+
+
 def test_another_problem_is_not_resumed(config, episodes, capsys):
     path = config(optimizer={"steps": 1})
     assert main(["--config", path]) == 0

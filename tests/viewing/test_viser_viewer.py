@@ -1,11 +1,13 @@
 """Viser server: it answers a browser, and what it sends follows the frames."""
 
+import socket
 import struct
 import sys
 import threading
 import time
 import urllib.request
 from dataclasses import replace
+from pathlib import Path
 
 import msgspec
 import numpy as np
@@ -46,6 +48,14 @@ def test_the_server_answers_a_browser(viewer):
     with urllib.request.urlopen(f"http://127.0.0.1:{viewer.port}", timeout=10) as answer:
         assert answer.status == 200
         assert b"<html" in answer.read(1000)
+
+
+def test_the_server_listens_to_this_machine_only(viewer):
+    if not Path("/proc/net/tcp").exists():
+        pytest.skip("needs Linux's table of sockets")
+    sockets = [line.split() for line in Path("/proc/net/tcp").read_text().splitlines()[1:]]
+    listening = {local.split(":")[0] for _, local, _, state, *_ in sockets if local.endswith(f":{viewer.port:04X}")}
+    assert listening == {f"{int.from_bytes(socket.inet_aton('127.0.0.1'), sys.byteorder):08X}"}
 
 
 def test_a_port_that_is_taken_is_no_obstacle(viewer, film):

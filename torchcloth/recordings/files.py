@@ -170,10 +170,11 @@ def save_npz(file: Path | BinaryIO, arrays: Mapping[str, Any]) -> None:
 
 def _reject_repeated_keys(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     """Refuse an object in which a key occurs twice: one of its values would be ignored."""
-    values = dict(pairs)
-    if len(values) < len(pairs):
-        keys = [key for key, _ in pairs]
-        raise ValueError(f"{next(key for key in keys if keys.count(key) > 1)!r} twice in an object")
+    values: dict[str, Any] = {}
+    for key, value in pairs:
+        if key in values:
+            raise ValueError(f"{key!r} twice in an object")
+        values[key] = value
     return values
 
 

@@ -95,6 +95,17 @@ def test_a_compressed_bag_is_read(tmp_path):
     np.testing.assert_array_equal(read(truth).grippers["left"].position, expected.grippers["left"].position)
 
 
+def test_messages_that_are_computed_without_end(tmp_path):
+    truth = foreign_formats.write_ros2(tmp_path, "sqlite3")
+    endless = "with recursive n(i) as (select 1 union all select i + 1 from n)"
+    with closing(sqlite3.connect(truth.path / "bag_sqlite3.db3")) as database:
+        database.execute("alter table messages rename to stored")
+        database.execute(f"create view messages as {endless} select stored.* from stored, n")
+        database.commit()
+    with pytest.raises(RecordingError, match="got view 'messages'; expected tables only"):
+        read(truth)
+
+
 def test_a_chunk_that_unpacks_to_more_than_it_declares(zstd_bomb):
     from rosbags.rosbag2 import storage_mcap
 

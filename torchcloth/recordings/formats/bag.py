@@ -19,6 +19,10 @@ SQLITE_SIGNATURE = b"SQLite format 3\x00"
 STORAGE_SIGNATURES = {".mcap": mcap_checksums.MCAP_SIGNATURE, ".db3": SQLITE_SIGNATURE}
 ROS1_SIGNATURE, ROS1_SUFFIX = b"#ROSBAG V2.0", ".bag"
 METADATA_FILE = "metadata.yaml"
+# What is computed when it is read, perhaps without end.
+COMPUTED_TABLES_QUERY = (
+    "select type, name from sqlite_master where type in ('view', 'trigger') or sql like 'create virtual%'"
+)
 
 
 class BagMessage(NamedTuple):
@@ -183,6 +187,10 @@ def _check_sqlite(file: Path) -> None:
     with report_damage(file, "sqlite3 file"):
         connection = sqlite3.connect(f"file:{place}?immutable=1", uri=True)
         try:
+            computed = connection.execute(COMPUTED_TABLES_QUERY).fetchone()
+            if computed is not None:
+                got, expected = f"{computed[0]} {computed[1]!r}", "tables only, as recorders write them"
+                raise RecordingError(f"{file} is no sound sqlite3 file", got=got, expected=expected)
             report = connection.execute("PRAGMA integrity_check").fetchone()[0]
         finally:
             connection.close()
