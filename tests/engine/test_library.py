@@ -127,9 +127,11 @@ def test_the_name_sees_sources_flags_and_processor(small, monkeypatch):
     names.add(building.file_name())
     monkeypatch.setattr(building, "FLAGS", building.FLAGS + " -DX")
     names.add(building.file_name())
+    monkeypatch.setenv("TORCHCLOTH_ENGINE_FLAGS", "-DY")
+    names.add(building.file_name())
     monkeypatch.setattr(building, "_processor", lambda: "another")
     names.add(building.file_name())
-    assert len(names) == 4
+    assert len(names) == 5
 
 
 @pytest.mark.slow

@@ -31,6 +31,7 @@ FLAGS = (
     "-fvisibility=hidden -Wno-psabi -pthread"
 )
 NATIVE_FLAG = "-march=native"
+EXTRA_FLAGS_VARIABLE = "TORCHCLOTH_ENGINE_FLAGS"  # such as those of sanitizers; a library is named by them, too
 # What /proc/cpuinfo lists for the instruction set levels of the x86-64 psABI.
 X86_64_V2_FEATURES = frozenset({"cx16", "lahf_lm", "popcnt", "pni", "sse4_1", "sse4_2", "ssse3"})
 X86_64_V3_FEATURES = X86_64_V2_FEATURES | {"abm", "avx", "avx2", "bmi1", "bmi2", "f16c", "fma", "movbe", "xsave"}
@@ -61,12 +62,17 @@ class EngineUnavailable(RuntimeError):
 
 def file_name() -> str:
     """Return the name of the library for these sources on this processor."""
-    return f"engine-{_digest(f'{FLAGS} {platform.machine()} {_processor()}')}.so"
+    return f"engine-{_digest(' '.join([FLAGS, platform.machine(), _processor(), *_extra_flags()]))}.so"
 
 
 def portable_file_name(level: str) -> str:
     """Return the name of the portable library for these sources, e.g. ``engine-x86-64-v3-0123456789abcdef0123.so``."""
     return f"engine-{level}-{_digest(FLAGS)}.so"
+
+
+def _extra_flags() -> list[str]:
+    """Flags of the environment, separated by spaces, which a native library is built with."""
+    return os.environ.get(EXTRA_FLAGS_VARIABLE, "").split()
 
 
 def _digest(target: str) -> str:
@@ -197,13 +203,15 @@ def build(level: str | None = None) -> Path:
     """
     command = compiler()
     name = file_name() if level is None else portable_file_name(level)
-    flags = FLAGS if level is None else FLAGS.replace(NATIVE_FLAG, f"-march={level}")
+    flags = [*FLAGS.split(), *_extra_flags()]
+    if level is not None:
+        flags = FLAGS.replace(NATIVE_FLAG, f"-march={level}").split()
     for folder in private_cache_folders():
         with suppress(OSError):
             target = folder / name
             with _build_lock(folder):  # another process may be building the same
                 if loadable_file(target) is None:
-                    _compile(command, target, flags.split())
+                    _compile(command, target, flags)
             return target
     places = ", ".join(str(f) for f in cache_folders())
     reason = f"no folder for the engine's library can be written to ({places})"
@@ -262,7 +270,7 @@ def _compile(command: list[str], target: Path, flags: list[str]) -> None:
 
         with ThreadPoolExecutor(cores) as pool:
             objects = list(pool.map(compile_one, enumerate(files)))
-        _run([*command, "-shared", "-pthread", *objects, "-o", str(library)])
+        _run([*command, *flags, "-shared", *objects, "-o", str(library)])
         store(target, library.read_bytes())
 
 
