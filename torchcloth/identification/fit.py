@@ -33,9 +33,11 @@ from .residuals.blocks import select_blocks
 from .residuals.metrics import distance_metrics, force_rms
 from .residuals.rigid_carry import carry_rigidly, find_unbeaten_null, mean_forces, zero_forces
 from .result import Identification
-from .uncertainty.consider_covariance import solution_covariance
+from .uncertainty.consider_covariance import lasting_misfit, solution_covariance
 from .uncertainty.estimates import apply_profiles, make_estimates, make_nuisance_estimates, withdraw_estimates
 from .uncertainty.identifiability import describe_influences, find_combinations
+from .uncertainty.likely_reasons import describe_reasons, rank_reasons
+from .uncertainty.misfit import estimate_point_noise, find_misfit
 from .uncertainty.model_error import MODEL_ERRORS, ModelErrors, add_model_error
 from .uncertainty.profile_likelihood import compute_profiles
 from .uncertainty.replicates import assign_strata
@@ -166,7 +168,8 @@ def identify(
     before = objective.observe(objective.start)
     outcome = search.run(method, start, iterations, rate, not warm_start and stop != "paper", starts)
     refine_recordings = recordings if refine else []
-    fit = _assemble_result(search, before, outcome, began, profile, refine_recordings, model_errors)
+    noise_std = estimate_point_noise(recordings)
+    fit = _assemble_result(search, before, outcome, began, profile, refine_recordings, model_errors, noise_std)
     return replace(fit, model=describe_model(cloth, fit, originals, recordings, dt), warnings=[*notes, *fit.warnings])
 
 
@@ -253,6 +256,7 @@ def _assemble_result(
     profile: Sequence[str],
     refine_recordings: Sequence[Recording],
     model_errors: ModelErrors,
+    noise_std: float,
 ) -> Identification:
     """Turn the end of a search into estimates, distances and warnings."""
     full, used, checked = search.objective, outcome.objective_used, outcome.checked
@@ -284,6 +288,7 @@ def _assemble_result(
         "simulations": search.simulations,
         "seconds": time.perf_counter() - began,
         "points": sum(len(c) for e in full.episodes for c in e.clouds),
+        "points_noise": noise_std,
         "stable_step": full.cloth.stable_step(),
         "converged": final.converged,
         **_observation_entries(used, final),
@@ -296,10 +301,11 @@ def _assemble_result(
 
     # withdrawal and warnings
     unbeaten_null = find_unbeaten_null(full, end)
-    is_withdrawn = checked.is_withdrawn or bool(unbeaten_null)
+    misfit_reason = _find_misfit(used, final, fit, noise_std)
+    is_withdrawn = checked.is_withdrawn or bool(unbeaten_null or misfit_reason)
     if is_withdrawn:  # slopes of chaos, or far from the optimum, promise tiny errors
         estimates = withdraw_estimates(estimates, full.unknowns, final.raw)
-    warnings += [outcome.unfinished_reason] if outcome.unfinished_reason else []
+    warnings += [reason for reason in (misfit_reason, outcome.unfinished_reason) if reason]
     warnings += warn_of_skew(estimates, [name for name in checked.curved_parameters if name not in profiles])
     used_frames = [x[: len(e.times)] for x, e in zip(after, used.episodes, strict=True)]
     fit_of_used = {**fit, "rms_after": distance_metrics(used_frames, used.episodes, full.faces).rms}
@@ -324,6 +330,24 @@ def _assemble_result(
         forces_before=[_observed_forces(s.wrench, e) for s, e in zip(start, full.episodes, strict=True)],
         forces_after=[_observed_forces(s.wrench, e) for s, e in zip(end, full.episodes, strict=True)],
     )
+
+
+def _find_misfit(
+    used: Objective, final: levenberg_marquardt.Iterate, fit: Mapping[str, Any], noise_std: float
+) -> str:
+    """Return why the fit is too far from the points to say anything, and what may be the reason; empty where it is not.
+
+    Args:
+        used: objective of the frames that were used.
+        final: the solution.
+        fit: its distances.
+        noise_std: of the points [m].
+    """
+    if "points_misfit" not in fit:
+        return ""
+    over_start = fit["chamfer_after"] / fit["chamfer_before"] if fit["chamfer_before"] > 0 else 0.0
+    misfit = find_misfit(fit["points_misfit"], noise_std, over_start)
+    return misfit and f"{misfit}; {describe_reasons(rank_reasons(used, final))}"
 
 
 def _correct_for_mesh(
@@ -379,11 +403,12 @@ def _force_entries(full: Objective, start: list[Frames], end: list[Frames]) -> d
 
 def _observation_entries(full: Objective, final: levenberg_marquardt.Iterate) -> dict[str, float]:
     """Effective number of observations, and the residuals' standard deviation for each kind of data."""
-    entries, total = {}, 0.0
+    entries, total, misfit = {}, 0.0, lasting_misfit(full, final)
     for b, block in enumerate(full.blocks):
         residual = final.linear.residual[final.linear.blocks == b]
         residual = residual[residual != 0]
         if len(residual):
             entries[f"{block.name}_residual"] = float(final.scale[b])
+            entries[f"{block.name}_misfit"] = float(misfit[b].sqrt())
             total += float(final.effective_fraction[b]) * len(residual)
     return {"effective_observations": total, **entries}
