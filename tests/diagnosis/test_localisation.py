@@ -40,6 +40,13 @@ def test_it_shows_where_and_when_it_does_what_parameters_do_not():
     assert answer["response"] == {"value": pytest.approx(AMPLITUDE * BUMP, rel=0.1), "unit": "m"}
 
 
+@pytest.mark.parametrize(("gaining", "motion"), [(["a", "b"], "ab"), (["c", "d"], "c"), ([], "c"), (["other"], "c")])
+def test_it_shows_in_a_motion_that_gains_held_out(gaining, motion):
+    """Reported: "most significant in stretch", where the table of the same report said that it gains nothing."""
+    answer = localise_cause(with_cause(), "cause", ["a", "b", "c", "d"], EPISODES, gaining)
+    assert answer["when"]["motion"] in motion
+
+
 def test_what_forces_alone_tell_shows_at_a_gripper():
     def felt(cells):
         return cells._replace(block=torch.full_like(cells.block, BLOCK_NAMES.index("force")))

@@ -255,8 +255,16 @@ def _describe_cause(result: SearchResult, cause: AcceptedCause, motions: Sequenc
         "rms_removed_mm": 1e3 * (candidate.gain.rms_before - candidate.gain.rms_after),
         "permutation_test": {"log_density": test.gain, "quantile_95": test.quantile_95 or None},
         "explained_fraction": _fraction_of_cause(result, candidate.gain),
-        **localise_cause(result.end, h.name, motions, result.data.episodes),
+        **localise_cause(result.end, h.name, motions, result.data.episodes, _list_gaining_motions(result, motions)),
     }
+
+
+def _list_gaining_motions(result: SearchResult, motions: Sequence[str]) -> list[str]:
+    """Return the motions that the causes predict better, held out."""
+    if result.total_gain is None:
+        return []
+    gains = compare_by_motion(*result.held_out, result.noise_floor, motions)
+    return [motion for motion, gain in gains.items() if gain.log_density > 0]
 
 
 def _coordinate_errors(result: SearchResult, motions: Sequence[str]) -> Tensor:

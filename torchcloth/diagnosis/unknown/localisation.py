@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from typing import Any
 
 import torch
@@ -17,7 +17,13 @@ from ..inference.fitting import ModelFit, posterior_precision
 EPISODE_WINDOW_SPACING = 1000  # between the window numbers of two episodes
 
 
-def localise_cause(fitted: ModelFit, name: str, motions: Sequence[str], episodes: Sequence[Episode]) -> dict[str, Any]:
+def localise_cause(
+    fitted: ModelFit,
+    name: str,
+    motions: Sequence[str],
+    episodes: Sequence[Episode],
+    gaining_motions: Collection[str] = (),
+) -> dict[str, Any]:
     """Return the place and the time window in which an accepted cause is most significant, and its effect there.
 
     Positions are used unless forces carry nearly all information, and of them the most informative kind of data.
@@ -27,6 +33,7 @@ def localise_cause(fitted: ModelFit, name: str, motions: Sequence[str], episodes
         name: name of the cause.
         motions: label of each episode.
         episodes: those that the model was fitted to.
+        gaining_motions: motions that the causes predict better, held out. Others are left out, unless there is none.
 
     Returns:
         "where": {"at": [u, v] on the pattern [m]} or {"gripper": name}; "when": {"episode", "motion", "from", "to"}
@@ -44,6 +51,8 @@ def localise_cause(fitted: ModelFit, name: str, motions: Sequence[str], episodes
     selected = block < FORCE_BLOCK
     has_positions = information[selected].sum() > CRITERIA.report.min_position_information * information.sum()
     selected = selected if has_positions else ~selected
+    gains = torch.tensor([motion in gaining_motions for motion in motions])[episode]
+    selected = selected & gains if (selected & gains).any() else selected
     for column in (block, episode * EPISODE_WINDOW_SPACING + window, part):
         selected = selected & (column == _most_informative(column, information, selected))
     first = int(selected.nonzero()[0])
