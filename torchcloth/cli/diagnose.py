@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import re
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -14,6 +15,7 @@ from ..errors import InvalidInput
 from .output_paths import check_output_folder, check_outside_episodes, output_path, print_line, resume_hint
 from .recording_checks import add_checks_option
 
+LATER_EPISODE = re.compile(r", (?!1 )\d+ of \d+")  # a line of the same stage
 LONG_EPISODE_S = 10.0  # longer episodes are announced, because their cost grows with the cube of the duration
 
 
@@ -61,9 +63,10 @@ def _diagnose(options: argparse.Namespace) -> int:
         streams = [e.markers if e.points is None else e.points for e in episodes]
         durations = [float(s.t[-1] - s.t[0]) for s in streams if s is not None]
         seconds, longest = sum(durations), max(durations, default=0.0)
+        count = f"{len(episodes)} episode{'s' if len(episodes) > 1 else ''}"
         print(
-            f"{len(episodes)} episodes, observed for {seconds:.0f} s: this takes about "
-            f"{max(1, round(seconds / 1.5)):.0f} minutes of one core, up to three times as long if causes are found",
+            f"{count}, observed for {seconds:.0f} s: the time left is estimated from the first simulation, and grows "
+            "where several causes are found",
             flush=True,
         )
         if longest > LONG_EPISODE_S:
@@ -113,7 +116,7 @@ def show_progress_line() -> Iterator[Callable[[str], None]]:
         A function that takes the text to show.
     """
     if not sys.stderr.isatty():
-        yield lambda text: None if text.endswith("left") else print_line(text)
+        yield lambda text: None if LATER_EPISODE.search(text) else print_line(text)
         return
     from rich.console import Console
     from rich.markup import escape

@@ -11,6 +11,7 @@ from importlib import resources
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from .._utils.durations import IterationTimer
 from .._utils.files import PROGRESS_FOLDER_NAME
 from ..errors import InvalidInput
 from . import identify_fields
@@ -284,12 +285,13 @@ def _fit(options: argparse.Namespace, cloth: Cloth, episodes: list[Recording]) -
     columns = (BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), TextColumn("{task.description}"))
     with Progress(*columns, refresh_per_second=2, disable=not sys.stdout.isatty()) as progress:
         task = progress.add_task("simulating with the start values", total=None)
+        timer = IterationTimer(options.iterations)
 
         def advance(iteration: int, chamfer: float, values: dict[str, float], share: float) -> None:
             shown = ", ".join(f"{name} {value:.4g}" for name, value in list(values.items())[:3])
             used = "all frames" if share == 1 else f"first {100 * share:.0f} % of the frames"
             text = shown if math.isnan(chamfer) else f"Chamfer {1e3 * chamfer:.2f} mm, {shown}"
-            text = f"{used}, {text}"
+            text = ", ".join(filter(None, (used, text, timer.describe(iteration, share))))
             progress.update(task, completed=iteration, description=text)
             if not progress.console.is_terminal:  # in a log file the bar would appear only once, at the end
                 print_line(f"iteration {iteration}: {text}")

@@ -6,6 +6,7 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from .._utils.durations import IterationTimer
 from .._utils.files import PROGRESS_FOLDER_NAME
 from ..errors import InvalidInput
 from .diagnose import show_progress_line
@@ -117,7 +118,7 @@ def _plan(options: argparse.Namespace) -> int:
     check_output_folder(options.out)
     check_result_folder(options.out)
     recording, goal = recordings.read(options.episode), planning.read_goal(options.goal, options.correspondences)
-    models = _models(options, recording)
+    models, timer = _models(options, recording), IterationTimer(options.iterations)
     with show_progress_line() as progress:
         result = planning.plan(
             models,
@@ -131,7 +132,7 @@ def _plan(options: argparse.Namespace) -> int:
             acceleration=DEFAULT_JOINT_ACCELERATION if options.acceleration is None else options.acceleration,
             clearance=options.clearance,
             dt=options.dt,
-            on_progress=lambda *numbers: progress(_progress_text(*numbers)),
+            on_progress=lambda *numbers: progress(_progress_text(timer, *numbers)),
             journal=options.out / PROGRESS_FOLDER_NAME,
             resume=options.resume or None,
         )
@@ -162,5 +163,6 @@ def _models(options: argparse.Namespace, recording: Recording) -> list[Cloth] | 
     )
 
 
-def _progress_text(number: int, distance: float, best: float) -> str:
-    return f"motion {number}: {1e3 * distance:.2f} mm from the goal, the best so far {1e3 * best:.2f} mm"
+def _progress_text(timer: IterationTimer, number: int, distance: float, best: float) -> str:
+    text = f"motion {number}: {1e3 * distance:.2f} mm from the goal, the best so far {1e3 * best:.2f} mm"
+    return ", ".join(filter(None, (text, timer.describe(number))))

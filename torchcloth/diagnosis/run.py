@@ -34,6 +34,7 @@ from .models.base_model import build_base_model
 from .models.model_file import save_model
 from .report.cloud_overlays import make_overlays
 from .report.html_report import REPORT_FILE, write_report
+from .timetable import Timetable
 from .unknown.missing_force import estimate_missing_force
 from .unknown.residual_force import check_against_laws, is_residual, learn_residual_force
 
@@ -63,7 +64,8 @@ def diagnose(
             cause, and proposes the motion to record next.
         model: start of the search; None: the base model of the first episode, in vacuum.
         hypotheses: what is asked about; None: the catalogue. With ``resume`` a name must mean what it meant before.
-        progress: called with one line for each episode that is simulated.
+        progress: called with one line for each episode that is simulated, with the share that is done and an estimate
+            of the time left.
         journal: folder for finished episodes, a few hundred kilobytes each; None: nothing is stored.
         resume: whether to continue with what a stopped diagnosis left there; the answer is the same bit by bit. None:
             start over, but refuse a folder where it could continue.
@@ -121,6 +123,8 @@ def diagnose(
     # 4. Search, doubt, unknowns, verdict, proposal. Simulations run in parallel, so torch's own threads would only
     # wait.
     threads = torch.get_num_threads()
+    durations = [float(e.times[-1] - e.times[0]) for e in data.episodes]
+    progress = Timetable(durations, len(set(motions)) > 1).wrap(progress)
     with _torch_threads(1):
         result = search(model, data, asked, progress)
         result = check_against_laws(result, prefix_progress(progress, "laws without a cause"))
@@ -178,7 +182,8 @@ def _judge_with_unknowns(result: SearchResult, threads: int, progress: Progress)
             missing_force = estimate_missing_force(result.end, result.data, progress=progress)
     # laws find more than the lack of fit, because they know what it would look like
     needs_laws = result.has_held_out_motions and (is_inadequate or (meshes_agree and not result.causes))
-    residual_force = learn_residual_force(result.end, result.data, progress) if needs_laws else None
+    stage = prefix_progress(progress, "force laws")
+    residual_force = learn_residual_force(result.end, result.data, stage) if needs_laws else None
     return judge(result, result.data.motions, missing_force, residual_force)
 
 

@@ -172,7 +172,7 @@ def _simulate_response(
     fitted: ModelFit, data: DiagnosisData, k: int, fields: Tensor, window: float, progress: Progress
 ) -> _EpisodeResponse:
     e = data.episodes[k]
-    progress(f"{e.name}: missing force")
+    progress(f"missing force: {e.name}")
     windows = split_into_windows(e.times, window)
     pulses = ForcePulses(windows, expand_modes(windows, fields))
     frames, derivatives = differentiate_pulses(fitted.model.build_world(), e, pulses, data.dt)
