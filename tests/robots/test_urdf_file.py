@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import pytest
 
 import torchcloth.robots as robots
@@ -132,6 +134,11 @@ def test_a_urdf_reads_no_other_file(write, tmp_path):
     declared = f'<!DOCTYPE robot [<!ENTITY s SYSTEM "{secret.as_uri()}">]>'
     text = declared + ARM.replace('<link name="base"/>', '<link name="base"><visual>&s;</visual></link>')
     refuse(write(text=text), "not a URDF file that can be read; got Entity 's' not defined")
+
+
+def test_an_lxml_that_resolves_entities_of_files_cannot_be_installed():
+    text = (Path(__file__).parents[2] / "pyproject.toml").read_text()
+    assert '"lxml>=5"' in text
 
 
 def test_entities_of_entities_are_refused(write):

@@ -111,7 +111,7 @@ def _edit_json(rng: Random, node: Any, key: Any, donor: tuple[Any, Any]) -> None
 
 
 def mutate_in_place(rng: Random, data: bytes, limit: int, mutate_bytes: ByteMutation) -> bytes:
-    """Overwrite numbers of one to eight bytes, so that all else stays where it is."""
+    """Change numbers of one to eight bytes, so that all else stays where it is."""
     if not data or rng.random() < RAW_SHARE:
         return mutate_bytes(data, limit)
     changed = bytearray(data)

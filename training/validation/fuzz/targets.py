@@ -93,7 +93,7 @@ class LoadedFolder(Folder):
         self.arrays = arrays
 
     def read_npz(self, name: str) -> dict[str, np.ndarray]:
-        """Return the arrays."""
+        """Return the arrays that were read before."""
         return self.arrays
 
 

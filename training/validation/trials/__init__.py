@@ -1,0 +1,1 @@
+"""What strangers' habits and hostile inputs broke, what happens now, and the test of each line."""

@@ -1,0 +1,7 @@
+"""``python -m torchcloth.training.validation.trials``."""
+
+import sys
+
+from .command import main
+
+sys.exit(main())
