@@ -14,12 +14,23 @@ ONE_MOTION = (
     (0.7, "from the data sheet: fast, 1 of 1"),
     (2.4, "from the data sheet: fast, 1 of 1"),
     (3.1, "base model: fit 1: fast, 1 of 1"),
+    (4.0, "base model: fit 2: fast, 1 of 1"),
+    (4.8, "base model: fit 3: fast, 1 of 1"),
     (5.5, "base model: 38 causes: fast, 1 of 1"),
     (7.3, "bifurcating bins: fast, 1 of 1"),
     (8.5, "missing force: fast"),
-    (9.5, "next experiment: hang"),
-    (13.4, "next experiment: swing, 1.5 times as fast"),
-    (17.1, "next experiment: stretch"),
+    (9.5, "next experiment: hang, 1 of 12"),
+    (9.6, "next experiment: hang, grippers and cloth turned by 90 degrees, 2 of 12"),
+    (11.3, "next experiment: swing, 0.7 times as fast, 3 of 12"),
+    (11.3, "next experiment: swing, 4 of 12"),
+    (13.4, "next experiment: swing, 1.5 times as fast, 5 of 12"),
+    (13.6, "next experiment: swing, grippers and cloth turned by 90 degrees, 6 of 12"),
+    (15.3, "next experiment: swing-fast, 7 of 12"),
+    (15.8, "next experiment: swing-fast, grippers and cloth turned by 90 degrees, 8 of 12"),
+    (16.7, "next experiment: shake, 9 of 12"),
+    (17.1, "next experiment: stretch, 10 of 12"),
+    (18.7, "next experiment: turn, 11 of 12"),
+    (19.0, "next experiment: turn, grippers and cloth turned by 90 degrees, 12 of 12"),
 )
 ONE_MOTION_END_S = 21.3
 
@@ -72,8 +83,8 @@ def test_the_time_left_is_right_within_a_factor_of_two(monkeypatch, lines, count
     monkeypatch.setattr("os.cpu_count", lambda: 2)
     rows = replay(lines, count, count > 1, speed)
     assert rows[0][2] is None  # nothing has been measured
-    first_half = [(t, left) for t, _, left in rows[1:] if t < 0.5 * speed * end]
-    assert all(0.5 < left / (speed * end - t) < 2.0 for t, left in first_half)
+    first_part = [(t, left) for t, _, left in rows[1:] if t < 0.6 * speed * end]
+    assert all(0.5 < left / (speed * end - t) < 2.0 for t, left in first_part)
     shares = [int(re.findall(r"(\d+) % done", text)[0]) for _, text, _ in rows[1:]]
     assert 0 < shares[0] < 15 < 50 < shares[-1] < 100
 

@@ -22,8 +22,8 @@ WARM_START_WORK, BASE_MODEL_WORK, BIFURCATION_WORK = 3.0, 5.5, 1.5  # passes
 SEARCH_WORK = 26.0  # passes: 20 where a cause is found, 37 where many are tried and refused
 REST_OF_SEARCH = {"with ": 7.0, "without ": 2.0}  # passes, once a cause was accepted, or is tried to be dropped
 LAWS_WORK, PICTURES_WORK = 7.0, 0.3  # passes
-MISSING_FORCE_WORK, MISSING_FORCE_SHARE = 1.2, 0.5  # passes, and how often several motions ask for it
-EXPERIMENT_WORK, EXPERIMENT_SHARE = 7.2, 0.4  # passes of one episode, and how often several motions ask for one
+MISSING_FORCE_WORK, MISSING_FORCE_SHARE = 2.5, 0.5  # passes, and how often several motions ask for it
+EXPERIMENT_WORK, EXPERIMENT_SHARE = 10.0, 0.4  # passes of one episode, and how often several motions ask for one
 EXPERIMENT_S = 1.6  # mean duration of an experiment
 MIN_DURATION_S = 1e-3
 MEASURED_PASSES = 8  # the last ones, of which the mean is taken: those that were stored take no time
@@ -33,7 +33,7 @@ STAGES = (
     "pictures",
 )  # fmt: skip
 CAUSES_LINE = re.compile(r"\d+ causes: |, causes: |the other way: ")
-FIRST_EPISODE = re.compile(r", 1 of \d+")
+POSITION = re.compile(r", (\d+) of (\d+)")
 REST_OF_PASS = re.compile(r", \d+ s left$")
 
 
@@ -70,6 +70,7 @@ class Timetable:
         self._pass_begin, self._work_of_pass, self._done, self._lines = self._begin, 0.0, 0.0, 0
         self._passes: deque[tuple[float, float]] = deque(maxlen=MEASURED_PASSES)  # s, and passes that they are worth
         self._pass_s: float | None = None
+        self._cores, self._experiments_done = os.cpu_count() or 1, 0.0
 
     def wrap(self, progress: Progress) -> Progress:
         """Return a callback that adds share and time left to each line."""
@@ -92,26 +93,34 @@ class Timetable:
             return None
         done = self._done + (self._clock() - self._pass_begin) / max(self._pass_s, 1e-9)
         here = max(self._planned[STAGES[max(self._stage, 0)]] - done, MIN_STAGE_REST * done)
+        if self._experiments_done:
+            here = done * (1 / self._experiments_done - 1)
         return self._pass_s * (here + sum(self._planned[name] for name in STAGES[self._stage + 1 :]))
 
     def _advance(self, text: str) -> None:
         """Take note of a line: of its stage, and of what the lines before took."""
         now, stage = self._clock(), max(_find_stage(text), self._stage)
-        is_pass = FIRST_EPISODE.search(text) is not None
+        numbers = POSITION.search(text)
+        is_experiment = STAGES[stage] == "next experiment"
+        is_pass = numbers is not None and numbers[1] == "1" and not is_experiment
         if self._work_of_pass and (is_pass or stage != self._stage):
             self._passes.append((now - self._pass_begin, self._work_of_pass))
             seconds, work = map(sum, zip(*self._passes, strict=True))
             self._done += self._work_of_pass
             self._pass_s, self._pass_begin, self._work_of_pass = seconds / work, now, 0.0
         elif self._lines == 1:  # as many episodes as there are cores run at once
-            at_once = min(os.cpu_count() or 1, self._count)
+            at_once = min(self._cores, self._count)
             self._pass_s = (now - self._pass_begin) / (FIRST_PASS_WORK * at_once * self._first_share)
         if stage != self._stage:
-            self._stage, self._done, self._pass_begin = stage, 0.0, now
+            self._stage, self._done, self._pass_begin, self._experiments_done = stage, 0.0, now, 0.0
             self._planned[STAGES[stage]] = self._expected_if_begun[STAGES[stage]]
         if STAGES[stage] == "search":
             rest = next((rest for prefix, rest in REST_OF_SEARCH.items() if text.startswith(prefix)), SEARCH_WORK)
             self._done = max(self._done, SEARCH_WORK - rest)
+        if is_experiment and numbers is not None:
+            # this one begins as another ends, and the others that run are half done
+            ended = int(numbers[1]) - (self._cores + 1) / 2
+            self._experiments_done = max(ended / int(numbers[2]), 0.0) if int(numbers[1]) > self._cores else 0.0
         if is_pass:
             self._pass_begin, self._work_of_pass = now, self._find_work(text)
         self._lines += 1

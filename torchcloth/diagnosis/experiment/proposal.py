@@ -96,18 +96,20 @@ def propose_experiment(
     names = list(question.amplitudes)
     now = compute_chi2(question, compute_information(question, []))
 
-    def simulate(choice: FeasibleExperiment) -> tuple[FeasibleExperiment, Tensor] | None:
-        progress(str(choice.experiment))
+    def simulate(item: tuple[int, FeasibleExperiment]) -> tuple[FeasibleExperiment, Tensor] | None:
+        k, choice = item
+        progress(f"{choice.experiment}, {k + 1} of {len(possible)}")
         try:
             return choice, simulate_whitened_slopes(question, replace(choice.episode, joints={}), data)
         except (TorchclothError, torch.linalg.LinAlgError):  # pyright: ignore[reportPrivateImportUsage]
             return None  # an experiment that cannot be simulated says nothing
 
     choices = check_feasibility(data.recordings, progress)
-    if not result.has_held_out_motions:  # a repetition would leave a single motion
+    if content.get("single_motion"):  # a repetition would leave a single motion
         choices = [choice for choice in choices if str(choice.experiment) not in data.motions]
     refused = {str(c.experiment): c.why_not for c in choices if c.why_not is not None}
-    answers = map_parallel(simulate, [c for c in choices if not c.why_not])
+    possible = [c for c in choices if not c.why_not]
+    answers = map_parallel(simulate, list(enumerate(possible)))
     simulated = [answer for answer in answers if answer is not None]
     if not simulated:
         return None
