@@ -11,7 +11,10 @@ from torchcloth.diagnosis import build_base_model, diagnose, list_hypotheses
 from torchcloth.diagnosis.decide import search as search_module
 from torchcloth.diagnosis.decide.in_sample import rank_in_sample
 from torchcloth.diagnosis.decide.search import SearchResult, search
-from torchcloth.diagnosis.experiment.proposal import find_open_question
+from torchcloth.diagnosis.experiment import proposal
+from torchcloth.diagnosis.experiment.feasibility import FeasibleExperiment
+from torchcloth.diagnosis.experiment.motions import Experiment
+from torchcloth.diagnosis.experiment.proposal import find_open_question, propose_experiment
 from torchcloth.diagnosis.inference.comparison import has_held_out_motions
 from torchcloth.diagnosis.inference.screening import screen
 from torchcloth.diagnosis.report.wording import VERDICTS, describe_next_step, write_sentences
@@ -60,6 +63,29 @@ def test_the_next_motion_distinguishes_what_explains_a_single_one_as_well():
     alone = find_open_question(result, {"causes": [], "minor": [], "in_sample": rows[:1]})
     assert alone is not None
     assert (alone.pairs, list(alone.amplitudes)) == ((), names[:1])
+
+
+@pytest.mark.parametrize(("single", "tried"), [(True, ["turn"]), (False, ["swing", "turn"])])
+def test_the_motion_that_was_recorded_is_no_other_motion(monkeypatch, single, tried):
+    result = make_result([0.0, HIDDEN_A, 0.0, 0.0], ["swing"], alike=0.3)
+    rows = [explanation.as_dict() for explanation in rank_in_sample(result)]
+    content = {"causes": [], "minor": [], "in_sample": rows, "single_motion": single}
+    choices = [FeasibleExperiment(Experiment(name), sheet_episodes.make_episode()) for name in ("swing", "turn")]
+    simulated = []
+
+    def simulate(question, *_):
+        simulated.append(1)
+        columns = result.end.linearisation.n_coordinates + len(question.amplitudes)
+        return torch.randn(40, columns, generator=torch.Generator().manual_seed(0)).double()
+
+    said = []
+    monkeypatch.setattr(proposal, "check_feasibility", lambda *_: choices)
+    monkeypatch.setattr(proposal, "simulate_whitened_slopes", simulate)
+    answer = propose_experiment(result, content, SimpleNamespace(recordings=(), motions=["swing"]), said.append)  # type: ignore[arg-type]
+    assert answer is not None
+    assert sorted(text.partition(",")[0] for text in said) == tried
+    assert len(simulated) == len(tried)
+    assert answer.content["motion"] in tried
 
 
 def test_no_candidate_is_compared_without_a_motion_to_hold_out(monkeypatch):
