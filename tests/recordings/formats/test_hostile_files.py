@@ -19,7 +19,7 @@ import pytest
 from helpers import foreign_formats
 
 from torchcloth import recordings as rec
-from torchcloth.errors import RecordingError
+from torchcloth.errors import MissingDependency, RecordingError
 from torchcloth.recordings import formats
 from torchcloth.recordings.formats import bounded_decompression
 from torchcloth.recordings.images import PNG_SIGNATURE
@@ -122,6 +122,17 @@ def test_a_chunk_of_ros1_that_unpacks_to_gigabytes(monkeypatch):
     bounded_decompression.limit_rosbags()
     refuse_with_little_memory(lambda: reader.decompressors["lz4"](bomb))
     assert reader.decompressors["bz2"](bz2.compress(b"one")) == b"one"
+
+
+def test_a_rosbags_that_cannot_be_limited_is_not_used(monkeypatch):
+    from rosbags.rosbag2 import storage_mcap
+
+    monkeypatch.delattr(storage_mcap, "DECOMPRESSORS")
+    bounded_decompression.limit_rosbags.cache_clear()
+    with pytest.raises(MissingDependency, match="another version of rosbags; pip install --upgrade"):
+        bounded_decompression.limit_rosbags()
+    monkeypatch.undo()
+    bounded_decompression.limit_rosbags()
 
 
 @pytest.mark.parametrize("name", ["lz4", "zstd"])

@@ -210,6 +210,13 @@ def test_without_seeds_the_command_says_where_they_are(tmp_path, capsys):
     assert "root of the repository" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize("option", [["--inputs", "0"], ["--seconds", "-1"], ["--seconds", "nan"]])
+def test_a_search_without_an_end_or_a_beginning_is_refused(monkeypatch, capsys, option):
+    monkeypatch.chdir(ROOT)
+    assert command.main(["obj", *option]) == 2
+    assert "expected above 0" in capsys.readouterr().err
+
+
 def search(*lines: str, format_name: str, corpus: Path) -> subprocess.CompletedProcess:
     """Run the command in a process of its own, after these lines of Python."""
     pytest.importorskip("atheris")

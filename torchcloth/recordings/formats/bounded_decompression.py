@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from ..._utils.unpacking import check_unpacked_size
+from ...errors import MissingDependency
 
 PIECE_BYTES = 1 << 24
 COMPRESSED_PART = "a compressed part of a bag"
@@ -21,7 +22,19 @@ COMPRESSED_PART = "a compressed part of a bag"
 
 @cache
 def limit_rosbags() -> None:
-    """Make rosbags unpack within limits; rosbags and the libraries that it unpacks with must be installed."""
+    """Make rosbags unpack within limits.
+
+    Raises:
+        MissingDependency: rosbags is of another version, in which this is not known to work.
+    """
+    try:
+        _replace_decompressors()
+    except (ImportError, AttributeError, KeyError) as error:
+        remedy = 'pip install --upgrade "torchcloth[data]"'
+        raise MissingDependency("reading ROS bags needs another version of rosbags", remedy=remedy) from error
+
+
+def _replace_decompressors() -> None:
     import rosbags.rosbag1.reader as ros1_reader  # pyright: ignore[reportMissingImports]  (optional)
     import rosbags.rosbag2.reader as ros2_reader  # pyright: ignore[reportMissingImports]
     import rosbags.rosbag2.storage_mcap as mcap_storage  # pyright: ignore[reportMissingImports]

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import torch
 
-from torchcloth.errors import TorchclothError
+from torchcloth.errors import InvalidInput, TorchclothError
 
 from . import targets
 from .coverage import Search
@@ -31,8 +31,10 @@ def main(argv: list[str] | None = None) -> int:
     torch.set_default_dtype(torch.float64)
     try:
         if not seeds.is_dir():
-            print(f"fuzz: no folder {seeds}; run it at the root of the repository, or pass --seeds", file=sys.stderr)
-            return 2
+            remedy = "run it at the root of the repository, or pass --seeds"
+            raise InvalidInput("--seeds", got=f"no folder {seeds}", expected="a folder for each format", remedy=remedy)
+        if not (options.inputs > 0 and options.seconds > 0):
+            raise InvalidInput("--inputs, --seconds", got=f"{options.inputs}, {options.seconds}", expected="above 0")
         Search(fuzzed, corpus, [seeds], options.inputs, options.seconds).run()
     except (TorchclothError, OSError) as error:
         print(f"fuzz: {error}", file=sys.stderr)
