@@ -125,14 +125,12 @@ def test_a_chunk_of_ros1_that_unpacks_to_gigabytes(monkeypatch):
 
 
 def test_a_rosbags_that_cannot_be_limited_is_not_used(monkeypatch):
-    from rosbags.rosbag2 import storage_mcap
+    def fail():
+        raise AttributeError("DECOMPRESSORS")
 
-    monkeypatch.delattr(storage_mcap, "DECOMPRESSORS")
-    bounded_decompression.limit_rosbags.cache_clear()
+    monkeypatch.setattr(bounded_decompression, "_replace_decompressors", fail)
     with pytest.raises(MissingDependency, match="another version of rosbags; pip install --upgrade"):
-        bounded_decompression.limit_rosbags()
-    monkeypatch.undo()
-    bounded_decompression.limit_rosbags()
+        bounded_decompression.limit_rosbags.__wrapped__()
 
 
 @pytest.mark.parametrize("name", ["lz4", "zstd"])
