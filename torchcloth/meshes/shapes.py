@@ -112,6 +112,9 @@ def _check_corner_counts(corners: np.ndarray, path: Path) -> None:
 
 
 def _check_corners(polygons: np.ndarray, count: int, path: Path) -> None:
+    if polygons.dtype.kind not in "iu":
+        got = f"{path}, faces of {polygons.dtype} numbers"
+        raise InvalidInput("mesh file", got=got, expected="vertex numbers as integers", remedy="export it again")
     if polygons.min() < 0 or polygons.max() >= count:
         got = f"{path}, a face with vertex {int(polygons.max() if polygons.max() >= count else polygons.min())}"
         raise InvalidInput("mesh file", got=got, expected=f"vertices 0 to {count - 1}")
