@@ -96,6 +96,29 @@ end_header
 3 0 2 3 6 0 0 0.1 0.1 0 0.1
 """
 
+TUM_LISTS = """# colour
+1305031102.175 rgb/1.png
+1305031102.208 rgb/2.png
+
+====
+# depth
+1305031102.170 depth/1.png
+1305031102.203 depth/2.png
+
+====
+# timestamp tx ty tz qx qy qz qw
+1305031102.17 0.5 0.1 1.5 0.6 0.8 0.0 0.0
+1305031102.27 0.5 0.1 1.5 0.6 0.8 0.0 0.0
+"""
+TENSION_TABLE = """{"format": "torchcloth-tension", "version": 1, "length": 0.097, "width": 0.027, "angle": 0.785,
+ "preload": 0.15, "provenance": "measured", "licence": "CC0", "clamp": "rubber"}
+====
+repeat,displacement,force,lateral_strain
+0,0.0,0.15,
+0,0.00005,0.24,-0.0002
+1,0.00010,0.31,-0.0003
+"""
+
 
 def write_seeds(folder: Path) -> None:
     """Write the seeds of every format into folders of this folder."""
@@ -108,6 +131,8 @@ def write_seeds(folder: Path) -> None:
         "ply/wedge": WEDGE_PLY.encode(),
         "ply/binary": make_binary_ply(),
         "urdf/arm": ARM.encode(),
+        "tum/lists": TUM_LISTS.encode(),
+        "tension/table": TENSION_TABLE.encode(),
         "episode/all_keys": make_episode_json(),
         "tcm/model": make_model(),
         "checkpoint/scalars": make_checkpoint(),

@@ -97,6 +97,8 @@ def check_increasing(t: np.ndarray, place: str) -> None:
     """
     if t.size == 0:
         raise RecordingError(f"{place} is empty", expected="at least one time", remedy="leave the stream out instead")
+    if not np.isfinite(t[0]):
+        raise RecordingError(f"{place} is no time", got=f"{t[0]:g}", expected="seconds")
     if abs(t[0]) > MAX_EPOCH_S:
         unit, per_second = next((name, n) for name, (limit, n) in EPOCH_UNITS.items() if abs(t[0]) < limit)
         remedy = f"divide the stamps by {per_second:g}"

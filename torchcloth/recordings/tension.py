@@ -27,6 +27,7 @@ from .files import Folder
 TENSION_FORMAT, TENSION_VERSION = "torchcloth-tension", 1
 TENSION_TABLE_FILE, TENSION_ROWS_FILE = "table.json", "table.csv"
 MAX_SPECIMEN_LENGTH_M = 5.0  # the same number in millimetres is a loop of yarn
+MAX_REPEAT = 1e6  # larger numbers are no count of pulls, and above 2^53 no whole number is itself
 MAX_STRAIN = 5.0  # above it, displacements are not in the unit of the length
 _TENSION_COLUMNS = ("repeat", "displacement", "force", "lateral_strain")
 
@@ -141,7 +142,8 @@ def _read(folder: Folder) -> ForceDisplacement:
             expected="forces",
             remedy="was the load cell connected?",
         )
-    worst = float(np.abs(table.strain).max())
+    with np.errstate(over="ignore"):  # of a length that hardly is one
+        worst = float(np.abs(table.strain).max())
     if worst > MAX_STRAIN:
         raise RecordingError(
             f"{folder.location(TENSION_ROWS_FILE)}: displacement looks like millimetres",
@@ -175,7 +177,7 @@ def _columns(text: str, place: str) -> dict[str, np.ndarray]:
             raise RecordingError(f"{place}: {name} is not numbers", got=error, remedy="repair that row") from None
         out[name] = checks.check_array(numbers, f"{place}: {name}", (len(body),), nan=unseen)
     if "repeat" in out:
-        if (out["repeat"] != np.round(out["repeat"])).any():
+        if (out["repeat"] != np.round(out["repeat"])).any() or np.abs(out["repeat"]).max() > MAX_REPEAT:
             raise RecordingError(f"{place}: repeat is not whole", expected="0, 1, 2, ...")
         out["repeat"] = out["repeat"].astype(int)
     return out

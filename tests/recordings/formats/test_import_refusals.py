@@ -245,7 +245,7 @@ def test_a_refused_conversion_leaves_no_folders(copy, tmp_path):
     assert not (tmp_path / "new").exists()
 
 
-@pytest.mark.parametrize("time", ["1E9999999", "nan", "yesterday"])
+@pytest.mark.parametrize("time", ["1E9999999", "1e400", 400 * "9", "nan", "yesterday"])
 def test_a_time_that_is_none(time):
     with pytest.raises(RecordingError, match="is no time"):
         parse_nanoseconds(time, "rgb.txt")

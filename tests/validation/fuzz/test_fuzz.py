@@ -111,6 +111,13 @@ PLANTED = {  # format: (what is broken: owner, name, replacement; the input that
     "mcap": (checks, "normalise_unit", double, same),
     "sqlite": (checks, "normalise_unit", double, same),
     "rosbag1": (checks, "normalise_unit", double, same),
+    "tum": (checks, "check_transform", lambda matrix, place: 2 * matrix, same),
+    "tension": (
+        "torchcloth.recordings.tension.ForceDisplacement",
+        "strain",
+        property(lambda table: np.full(3, np.nan)),
+        same,
+    ),
     "checkpoint": ("torchcloth.training.fit.checkpoints", "_is_finite", lambda node: True, with_infinite_values),
 }
 READERS = {  # the function that reads the bytes of a format
@@ -123,6 +130,8 @@ READERS = {  # the function that reads the bytes of a format
     "mcap": (formats.ROS2_IMPORTER.read.__globals__["embedded"], "restore_files"),
     "sqlite": (formats.ROS2_IMPORTER.read.__globals__["embedded"], "restore_files"),
     "rosbag1": (formats.ROS2_IMPORTER.read.__globals__["embedded"], "restore_files"),
+    "tum": ("torchcloth.recordings.formats.tum", "_list"),
+    "tension": ("torchcloth.recordings.tension", "_columns"),
     "checkpoint": ("torchcloth.training.fit.module", "read_checkpoint"),
 }
 

@@ -7,6 +7,7 @@ import json
 import os
 import shutil
 import tempfile
+from collections.abc import Sequence
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -21,6 +22,7 @@ from torchcloth.errors import RecordingError
 from torchcloth.meshes import obj
 from torchcloth.recordings import formats, reading, streams
 from torchcloth.recordings.files import Folder
+from torchcloth.recordings.images import import_pillow
 from torchcloth.robots import load as load_arm  # pyright: ignore[reportMissingImports] - mapped from robots/
 from torchcloth.schemas import check_structure
 
@@ -32,6 +34,8 @@ MEMORY_FOLDER = Path("/dev/shm")  # a file system in memory, where there is one
 TOOL_FRAME = "tool"  # the last link of the seeds
 CHECKED_ANGLE_RAD = 0.3  # of every joint
 READING = "torchcloth.recordings"
+PART_SEPARATOR = b"\n====\n"  # between the files of an input that stands for several
+TUM_IMAGE_NAMES = ("1.png", "2.png")
 # What each topic of the seeds is.
 BAG_SCENE = {
     "provenance": "measured",
@@ -271,6 +275,50 @@ def read_sqlite(data: bytes) -> None:
 def read_rosbag1(data: bytes) -> None:
     """Read a bag of ROS 1."""
     _read_bag("bag.bag", data)
+
+
+def write_parts(folder: Path, names: Sequence[str], data: bytes) -> None:
+    """Write the parts of an input, between lines of equals signs, into the text files of a folder."""
+    parts = data.split(PART_SEPARATOR)
+    for i, name in enumerate(names):
+        (folder / name).write_bytes(parts[i] if i < len(parts) else b"")
+
+
+@cache
+def prepared_tum_folder() -> Path:
+    """Return a TUM folder with its images and scene, and without its lists."""
+    folder, Image = scratch_folder() / "tum", import_pillow()
+    for kind, dtype in (("rgb", np.uint8), ("depth", np.uint16)):
+        (folder / kind).mkdir(parents=True)
+        for name in TUM_IMAGE_NAMES:
+            shape = (3, 4, 3) if kind == "rgb" else (3, 4)
+            Image.fromarray(np.full(shape, 5000 if kind == "depth" else 100, dtype)).save(folder / kind / name)
+    camera = {"K": [[5.0, 0, 2], [0, 5, 1.5], [0, 0, 1]], "depth_scale": 0.0002}
+    scene = {**{key: BAG_SCENE[key] for key in ("provenance", "cloth")}, "cameras": {"cam0": camera}}
+    (scratch_folder() / "tum.json").write_text(json.dumps(scene))
+    return folder
+
+
+@register_format("tum", mutations.mutate_text, READING)
+def read_tum(data: bytes) -> None:
+    """Read the three lists of a TUM folder."""
+    folder = prepared_tum_folder()
+    write_parts(folder, ("rgb.txt", "depth.txt", "groundtruth.txt"), data)
+    invariants.check_recording(formats.read(folder, scene=scratch_folder() / "tum.json"))
+
+
+@register_format("tension", mutations.mutate_text, READING)
+def read_tension(data: bytes) -> None:
+    """Read the two files of a table of a tension machine."""
+    folder = scratch_folder() / "tension"
+    folder.mkdir(exist_ok=True)
+    write_parts(folder, ("table.json", "table.csv"), data)
+    table = rec.read_tension(folder)
+    require(table.displacement.shape == table.force.shape == (len(table),), "columns are as long as each other")
+    require(table.length > 0 and table.width > 0, "the strip has a size")
+    numbers = table.length, table.width, table.angle, table.preload
+    invariants.check_finite([("numbers", np.array(numbers)), ("strain", table.strain), ("force", table.force)])
+    require(table.repeat is None or table.repeat.dtype.kind == "i", "repeats are whole")
 
 
 @register_format("checkpoint", mutations.mutate_zip, "torchcloth.training.fit", "torch._weights_only_unpickler")
