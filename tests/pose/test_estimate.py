@@ -45,7 +45,7 @@ def test_intervals_cover_the_truth(scene, right):
     everywhere, hidden = coverage(right, scene)
     assert 0.88 <= everywhere <= 1.0
     assert 0.88 <= hidden <= 1.0
-    assert right.fit["std_rms"] < 2e-3  # and not because they are wide
+    assert right.fit["std_rms"] < 2.5e-3  # a millimetre of each grip is in it, and not much more
 
 
 def test_a_wrong_model_says_so_and_is_still_better_than_itself(scene, wrong):
@@ -274,7 +274,13 @@ def test_a_late_clock_sees_beyond_the_last_stamp(scene, monkeypatch):
         return float((result.x[-1] - scene.truth[len(counts) - 1]).norm(dim=-1).square().mean().sqrt())
 
     ask = partial(
-        estimate_pose, build_cloth(scene, twins.TRUE_FABRIC), seen, nuisances={"clock": 0.03}, modes=4, window=0.18
+        estimate_pose,
+        build_cloth(scene, twins.TRUE_FABRIC),
+        seen,
+        nuisances={"clock": 0.03},
+        modes=4,
+        window=0.18,
+        checks=False,  # they would correct the clock
     )
     result = ask()
     assert result.nuisances["clock"].value == pytest.approx(late, rel=0.1)

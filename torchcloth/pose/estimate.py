@@ -6,23 +6,25 @@ import math
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
-from typing import Any
+from typing import Any, cast
 
 import torch
 from torch import Tensor
 
 from .._utils.constants import STANDARD_GRAVITY_M_PER_S2
-from .._utils.linalg import find_last_knot
+from .._utils.linalg import cross, find_last_knot
 from .._utils.torch_modes import isolated_grad_mode
 from ..boundaries import Grasp
 from ..cloth import Cloth
 from ..episodes.observed import TIME_AFTER_KNOT_S, Episode, build_episode, require_cpu
 from ..episodes.unknowns import apply_priors, collect_unknowns
 from ..errors import InvalidInput, RecordingError
+from ..identification.estimators.objective import Objective
 from ..identification.nuisances import add_lookahead, as_stds, implied_nuisances, select_nuisances
 from ..identification.residuals.blocks import select_blocks
 from ..identification.residuals.metrics import MIN_NOISE_SCALE, distance_metrics
 from ..identification.residuals.rigid_carry import carry_rigidly
+from ..identification.uncertainty.consider_covariance import with_grasp_offsets
 from ..identification.uncertainty.estimates import make_estimates, make_nuisance_estimates
 from ..inspection.corrections import check_all
 from ..recordings import Recording
@@ -36,6 +38,8 @@ from .smoothing import SmoothedPose, smooth
 from .visibility import find_seen_vertices
 from .warnings import pose_warnings
 
+# A depth camera is off by patches, slowly, and the estimate follows it: by a millimetre at a metre (Kinect, stereo).
+SLOW_DEPTH_ERROR_STD_M = 1e-3
 INITIAL_FORCE_STD_M_PER_S2 = 0.5  # of the corrective force; its size is then learnt from the recording
 
 Progress = Callable[[str, float], None]
@@ -133,12 +137,16 @@ def _assemble_result(
     used, count = objective.used_data.first_fraction(1.0), episode.observed_count
     windows = [episode.times[[first, min(last, count - 1)]] for first, last in objective.force.windows]
     with torch.no_grad():
-        frames, derivatives = objective.simulate_with_tangents(raw)
+        wider, is_considered = with_grasp_offsets(objective)
+        wider_raw = wider.start.clone()
+        wider_raw[~is_considered] = raw
+        frames, derivatives = cast("CorrectedObjective", wider).simulate_with_tangents(wider_raw)
         x, v, slopes = frames.x[:count], frames.v[:count], derivatives.x[:, :count]
         uncorrected = objective.simulate_vertices(objective.start)[0][:count]
         rigid = carry_rigidly(episode)
         is_gripped = find_gripped_vertices(cloth, episode)
-        std = _standard_errors(objective, used, smoothed, x, slopes, all_modes, is_gripped)
+        considered = _considered_slopes(wider, wider_raw, is_considered, smoothed, slopes)
+        std = _standard_errors(objective, used, smoothed, x, slopes[~is_considered], considered, all_modes, is_gripped)
         last_state = objective.last_state(raw)
     seen = find_seen_vertices(x, used, cloth.mesh)
     force_fractions = _force_fractions(objective, raw, is_gripped.all(0), gravity)
@@ -200,10 +208,11 @@ def _standard_errors(
     smoothed: SmoothedPose,
     x: Tensor,
     slopes: Tensor,
+    considered: Tensor,
     all_modes: Modes,
     is_gripped: Tensor,
 ) -> Tensor:
-    """[T, V, 3] m, of the unknowns and of shapes that are finer than the force's modes."""
+    """[T, V, 3] m, of the unknowns, of grips, of shapes finer than the force's modes, and of slow errors of depth."""
     root = smoothed.covariance_root.to(slopes)
     variance = torch.stack([(root.mT @ frame.flatten(1)).square().sum(0) for frame in slopes.unbind(1)])
     stated = _stated_noise(objective, used)
@@ -212,7 +221,41 @@ def _standard_errors(
     fine_std = estimate_fine_scale_std(
         x, used, objective.faces, all_modes, coarse, is_gripped, noise_floor, default_noise
     )
-    return (variance.reshape(x.shape) + fine_std.square().unsqueeze(-1)).sqrt()
+    variance = variance.reshape(x.shape) + considered.square().sum(0) + fine_std.square().unsqueeze(-1)
+    if any(map(len, used.clouds)):
+        slow_std = SLOW_DEPTH_ERROR_STD_M if stated is None else min(stated, SLOW_DEPTH_ERROR_STD_M)
+        variance = variance + slow_std**2 * _vertex_normals(x, objective.faces).square()
+    return variance.sqrt()
+
+
+def _considered_slopes(
+    wider: Objective, raw: Tensor, is_considered: Tensor, smoothed: SmoothedPose, slopes: Tensor
+) -> Tensor:
+    """[N, T, V, 3] m, errors of the estimate for an error of one standard deviation of each grip's place.
+
+    A grip that is elsewhere moves the cloth, and the fitted unknowns by what they make up for.
+
+    Args:
+        wider: objective with the grips' offsets, whose tangents are remembered.
+        raw: [K] the solution, with offsets of zero.
+        is_considered: [K] which unknowns are offsets.
+        smoothed: the solution.
+        slopes: [K, T, V, 3] of the vertices.
+    """
+    jacobian, stds = wider.linearise(raw).jacobian, wider.prior_std[is_considered]
+    weight = smoothed.final.row_weights()[0][:, None]
+    gradient = (weight * jacobian[:, ~is_considered]).mT @ (jacobian[:, is_considered] * stds)
+    response = (smoothed.covariance @ gradient).to(slopes)
+    direct = slopes[is_considered] * stds.to(slopes)[:, None, None, None]
+    return direct - torch.einsum("ktvc,kn->ntvc", slopes[~is_considered], response)
+
+
+def _vertex_normals(x: Tensor, faces: Tensor) -> Tensor:
+    """[T, V, 3] unit normals, weighted by area."""
+    a, b, c = x[:, faces].unbind(2)
+    return torch.nn.functional.normalize(
+        torch.zeros_like(x).index_add(1, faces.flatten(), cross(b - a, c - a).repeat_interleave(3, 1)), dim=-1
+    )
 
 
 def find_gripped_vertices(cloth: Cloth, episode: Episode) -> Tensor:
