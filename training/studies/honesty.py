@@ -3,7 +3,8 @@
 MuJoCo makes one short recording for each seed, without a stated noise, with one to three faults (lag, jitter of the
 stamps, hinge or clamp, first shape, density, camera, lost or frozen frames, robot points, coarse mesh, start, a search
 that is cut short). The command ``torchcloth identify`` fits every recording, as a stranger would. ``--compare`` runs
-another installation of torchcloth on the same recordings, without and with the true noise stated.
+another installation of torchcloth on the same recordings, without and with the true noise stated. On some of them
+``torchcloth pose`` estimates every vertex, whose standard errors are compared with the true places.
 """
 
 from __future__ import annotations
@@ -19,27 +20,33 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from torchcloth import recordings
-from torchcloth._utils.files import to_json, write_text
+from torchcloth._utils.constants import Z_95
+from torchcloth._utils.files import to_json, write_atomically, write_text
 from torchcloth.errors import InvalidInput
+from torchcloth.inspection.corrections import find_frozen_clouds
 
 from ..resumable import ResumableStudy, check_jobs, write_result
-from ..validation.independent.rig_recording import MeshSize, make_rig_recording
+from ..validation.independent.rig_recording import GRIP_RADIUS_M, MeshSize, make_rig_recording
 from .fabric_tables import NO_VALUE, make_table
 from .hidden_rates import Rate
 
-RIGS, FAST_RIGS = 40, 2
+RIG_COUNT, FAST_RIG_COUNT = 40, 2
+POSE_COUNT, FAST_POSE_COUNT = 10, 1
 FAST_SIZE = MeshSize(truth=13, fit=9, coarse=7)
 PARAMETER_SYMBOLS = {"membrane_stiffness": "E h", "poisson_ratio": "ν", "bending.stiffness": "B", "air.normal": "C_n"}
 MAX_STD_ERRORS = 3.0
-THIS_VERSION, NOISE_STATED = "this version", "noise stated"
+THIS_VERSION, NOISE_STATED, POSE_CASE = "this version", "noise stated", "pose"
 MAX_MESSAGE_CHARACTERS = 300
 REPORTED_FIT_ENTRIES = ("iterations", "simulations", "converged", "rms_after", "points_residual", "points_misfit")
 
 
 def add(parser: argparse.ArgumentParser) -> None:
     """Add the study's options."""
-    parser.add_argument("--rigs", type=int, metavar="N", help=f"number of recordings ({RIGS}; more can be added later)")
+    parser.add_argument("--rigs", type=int, metavar="N", help=f"recordings ({RIG_COUNT}; more can be added later)")
+    parser.add_argument("--poses", type=int, metavar="N", help=f"recordings whose poses are estimated ({POSE_COUNT})")
     parser.add_argument("--first", type=int, default=0, metavar="SEED", help="seed of the first recording (0)")
     parser.add_argument("--jobs", type=int, default=1, metavar="N", help="number of fits at a time (1)")
     parser.add_argument(
@@ -52,9 +59,12 @@ def add(parser: argparse.ArgumentParser) -> None:
 def run(options: argparse.Namespace) -> None:
     """Fit every recording that is missing; print and write the tables."""
     check_jobs(options.jobs)
-    count = (FAST_RIGS if options.fast else RIGS) if options.rigs is None else options.rigs
-    if count < 1 or options.first < 0:
-        raise InvalidInput("--rigs, --first", got=f"{count}, {options.first}", expected="1 or more; 0 or more")
+    count = (FAST_RIG_COUNT if options.fast else RIG_COUNT) if options.rigs is None else options.rigs
+    poses = (FAST_POSE_COUNT if options.fast else POSE_COUNT) if options.poses is None else options.poses
+    if count < 1 or options.first < 0 or not 0 <= poses <= count:
+        got = f"{count}, {options.first}, {poses}"
+        expected = "1 or more; 0 or more; at most as many as rigs"
+        raise InvalidInput("--rigs, --first, --poses", got=got, expected=expected)
     interpreters = {THIS_VERSION: sys.executable}
     if options.compare is not None:
         name, _, python = options.compare.partition("=")
@@ -69,11 +79,14 @@ def run(options: argparse.Namespace) -> None:
         for seed in seeds
         for name, python in interpreters.items()
     }
+    pose_seeds = seeds[:poses]
+    cases |= {case_name(seed, POSE_CASE): partial(run_pose, options.out, seed, options.fast) for seed in pose_seeds}
     finished = study.run(cases, options.jobs)
     answers = {name: {seed: finished[case_name(seed, name)] for seed in seeds} for name in interpreters}
-    print_tables(answers)
-    path = write_result(options.out / "honesty.json", "honesty", {"answers": answers})
-    write_text(options.out / "honesty.md", to_markdown(answers))
+    pose_cases = {seed: finished[case_name(seed, POSE_CASE)] for seed in pose_seeds}
+    print_tables(answers, pose_cases)
+    path = write_result(options.out / "honesty.json", "honesty", {"answers": answers, "poses": pose_cases})
+    write_text(options.out / "honesty.md", to_markdown(answers, pose_cases))
     print(f"result: {path}, {options.out / 'honesty.md'}")
 
 
@@ -107,14 +120,52 @@ def run_case(out: Path, seed: int, fast: bool, version: str, python: str) -> dic
     }
 
 
+def run_pose(out: Path, seed: int, fast: bool) -> dict[str, Any]:
+    """Estimate the pose of a seed's recording, and compare every free vertex with its true place."""
+    episode, truth = find_or_make_recording(out, seed, fast)
+    folder = out / "poses" / f"{seed:03d}"
+    shutil.rmtree(folder, ignore_errors=True)
+    seconds, message = run_command(sys.executable, ["pose", str(episode), "--out", str(folder)])
+    case = {"motion": truth["motion"], "faults": truth["faults"], "cpu_seconds": seconds}
+    if not (folder / "pose.npz").exists():
+        return {**case, "refused": message}
+    recording = recordings.read(episode)
+    true_vertices = np.load(out / "truth" / f"{seed:03d}.npy")
+    with np.load(folder / "pose.npz") as pose:
+        x, std, uncorrected = (pose[key].astype(float) for key in ("x", "std", "uncorrected"))
+    if len(x) < len(true_vertices):  # a pose has no frames where clouds were frozen
+        true_vertices = true_vertices[~find_frozen_clouds(recording.require("points"))]
+    places = np.concatenate([np.asarray(grasp.uv) for grasp in recording.grasps.values()])
+    uv = np.asarray(recording.cloth.uv)
+    is_free = np.linalg.norm(uv[:, None] - places, axis=-1).min(1) > GRIP_RADIUS_M
+    error, std = (x - true_vertices)[:, is_free], std[:, is_free]
+    simulated = (uncorrected - true_vertices)[:, is_free]
+    return {
+        **case,
+        "refused": "",
+        "seconds_recorded": float(np.ptp(recording.require("points").t)),
+        "rms": _rms(error),
+        "rms_simulated": _rms(simulated),
+        "std_rms": _rms(std),
+        "coverage": float((np.abs(error) < Z_95 * std).mean()),
+    }
+
+
+def _rms(vectors: np.ndarray) -> float:
+    """Root mean square length of vectors [..., 3]."""
+    return float(np.sqrt(np.square(vectors).sum(-1).mean()))
+
+
 def find_or_make_recording(out: Path, seed: int, fast: bool) -> tuple[Path, dict[str, Any]]:
     """Return the folder of a seed's recording, and what is hidden in it."""
     episode = out / "episodes" / f"{seed:03d}"
     truth_path = out / "truth" / f"{seed:03d}.json"
-    if not truth_path.exists():
+    if not (truth_path.exists() and truth_path.with_suffix(".npy").exists()):
         made = make_rig_recording(seed, FAST_SIZE if fast else None)
         recordings.write(made.recording, episode, overwrite=True)
         truth_path.parent.mkdir(parents=True, exist_ok=True)
+        with write_atomically(truth_path.with_suffix(".npy")) as part:
+            np.save(part, made.vertices)
         hidden = {"motion": made.motion, "faults": made.faults, "truth": made.truth}
         write_text(truth_path, to_json({**hidden, "noise_std": made.noise_std, "iterations": made.iterations}))
     return episode, json.loads(truth_path.read_text())
@@ -219,8 +270,33 @@ def _ratio(case: Mapping[str, Any], name: str) -> str:
     return f"{e['value'] / truth:.2f} ± {e['std'] / truth:.2f}" + ("" if holds else " !")
 
 
-def print_tables(answers: Answers) -> None:
-    """Print the summary and every number."""
+POSE_HEADINGS = (
+    "seed",
+    "motion",
+    "faults",
+    "recorded, s",
+    "simulated, mm",
+    "estimate, mm",
+    "std. error, mm",
+    "in 95 %",
+    "CPU s",
+)
+
+
+def _pose_rows(poses: Mapping[int, Mapping[str, Any]]) -> list[tuple[str, ...]]:
+    rows = []
+    for seed, case in poses.items():
+        first = (str(seed), case["motion"], ", ".join(f"{fault} {size}" for fault, size in case["faults"].items()))
+        numbers = ("refused", *[NO_VALUE] * 4)
+        if not case["refused"]:
+            lengths = (f"{1e3 * case[key]:.2f}" for key in ("rms_simulated", "rms", "std_rms"))
+            numbers = (f"{case['seconds_recorded']:.1f}", *lengths, f"{100 * case['coverage']:.0f} %")
+        rows.append((*first, *numbers, f"{case['cpu_seconds']:.0f}"))
+    return rows
+
+
+def print_tables(answers: Answers, poses: Mapping[int, Mapping[str, Any]]) -> None:
+    """Print the summary, every number, and the poses."""
     from rich.console import Console
     from rich.markup import escape
 
@@ -234,15 +310,23 @@ def print_tables(answers: Answers) -> None:
     )
     for row in _case_rows(answers):
         table.add_row(*map(escape, row))
-    console.print(summary)
-    console.print(table)
+    pose_table = make_table("Distance of vertices from the truth, root mean square", *POSE_HEADINGS, left=3)
+    for row in _pose_rows(poses):
+        pose_table.add_row(*map(escape, row))
+    for part in (summary, table, pose_table):
+        console.print(part)
 
 
-def to_markdown(answers: Answers) -> str:
-    """Return both tables as Markdown."""
+def to_markdown(answers: Answers, poses: Mapping[int, Mapping[str, Any]]) -> str:
+    """Return the tables as Markdown."""
 
     def table(headings: Sequence[str], rows: Sequence[Sequence[str]], left: int) -> str:
         rule = ["---" if k < left else "---:" for k in range(len(headings))]
         return "".join(f"| {' | '.join(line)} |\n" for line in (headings, rule, *rows))
 
-    return table(SUMMARY_HEADINGS, summarise(answers), 1) + "\n" + table(CASE_HEADINGS, _case_rows(answers), 4)
+    parts = (
+        table(SUMMARY_HEADINGS, summarise(answers), 1),
+        table(CASE_HEADINGS, _case_rows(answers), 4),
+        table(POSE_HEADINGS, _pose_rows(poses), 3),
+    )
+    return "\n".join(parts)

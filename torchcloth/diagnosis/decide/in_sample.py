@@ -35,7 +35,7 @@ class InSampleExplanation(NamedTuple):
 
 
 def rank_in_sample(result: SearchResult) -> list[InSampleExplanation]:
-    """Rank the hypotheses that are worth a fit by their expected gain; empty if motions were held out.
+    """Return the hypotheses that are worth a fit, the largest expected gain first; empty if motions were held out.
 
     Each would be a candidate if another motion were there to predict. Two explain the data equally well if their
     expected gains differ by less than what two simulators may differ by.

@@ -16,8 +16,14 @@ from ..estimators import levenberg_marquardt
 from ..estimators.objective import Objective
 from ..nuisances import AbstractNuisance, CameraOffset, ClockOffset, GraspOffset, InitialShapeOffset
 
-# Wide priors: a reason may be a large error.
-CLOCK_STD_S, CAMERA_STD_M, GRASP_STD_M, SHAPE_STD_M, JITTER_STD_S = 0.05, 5e-3, 5e-3, 1e-2, 0.03
+# Standard deviations of wide priors: a reason may be a large error.
+LARGE_LAG_S, LARGE_CAMERA_ERROR_M, LARGE_GRIP_ERROR_M, LARGE_SHAPE_ERROR_M, LARGE_JITTER_S = (
+    0.05,
+    5e-3,
+    5e-3,
+    1e-2,
+    0.03,
+)
 JITTER = "jitter"
 REASON_WORDS = {
     "clock": "a lag of the stamps, or a grip that yields",
@@ -53,10 +59,10 @@ def rank_reasons(objective: Objective, final: levenberg_marquardt.Iterate) -> li
     candidates: list[AbstractNuisance] = [
         kind(std)
         for kind, std in (
-            (ClockOffset, CLOCK_STD_S),
-            (CameraOffset, CAMERA_STD_M),
-            (GraspOffset, GRASP_STD_M),
-            (InitialShapeOffset, SHAPE_STD_M),
+            (ClockOffset, LARGE_LAG_S),
+            (CameraOffset, LARGE_CAMERA_ERROR_M),
+            (GraspOffset, LARGE_GRIP_ERROR_M),
+            (InitialShapeOffset, LARGE_SHAPE_ERROR_M),
         )
         if kind.name not in fitted
     ]
@@ -117,5 +123,5 @@ def _jitter_decrease(clock: Tensor, residual: Tensor, weight: Tensor, frame: Ten
     count = int(frame.max()) + 1
     information = clock.new_zeros(count).index_add(0, frame, weight * clock.square())
     gradient = clock.new_zeros(count).index_add(0, frame, weight * clock * residual)
-    hessian = information + JITTER_STD_S**-2
+    hessian = information + LARGE_JITTER_S**-2
     return float((gradient.square() / hessian - information / hessian).sum())

@@ -11,6 +11,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.interpolate import CubicSpline
 
 from torchcloth._utils.constants import STANDARD_AIR_DENSITY_KG_PER_M3
 from torchcloth.recordings import PointClouds, Recording
@@ -41,8 +42,8 @@ GRIP_RADIUS_M = 0.026
 MAX_LAG_S, MAX_JITTER_STD_S = 0.06, 0.04
 CLAMP_EXTRA_RADIUS_M, HINGE_RADIUS_M = 0.012, 1e-3
 FIRST_SHAPE_ERROR_RANGE_M, SHAPE_ERROR_NODES = (2e-3, 6e-3), 4
-DENSITY_ERROR, CAMERA_SHIFT_M, START_FACTOR = 0.1, 5e-3, 10.0
-GAP_FRAMES, LOST_FRACTION = 5, 0.2
+DENSITY_ERROR, CAMERA_SHIFT_M, START_ERROR_FACTOR = 0.1, 5e-3, 10.0
+GAP_FRAMES, DROPPED_FRACTION = 5, 0.2
 FINGER_POINTS, FINGER_SIZE_M, FINGER_HEIGHT_M = 25, (0.03, 0.03, 0.08), 0.05  # its middle above the grasp point
 CUT_SHORT_ITERATIONS = 4
 MIN_STAMP_STEP_S = 1e-4
@@ -74,7 +75,7 @@ class Rig:
         lag: by which stamps are late [s].
         jitter: standard deviation of each stamp [s].
         first_shape_error: root mean square [m].
-        lost, frozen, has_robot_points: faults of the clouds.
+        has_gaps, frozen, has_robot_points: faults of the clouds.
         iterations: after which the search is cut short; None: it is not.
     """
 
@@ -84,7 +85,7 @@ class Rig:
     lag: float = 0.0
     jitter: float = 0.0
     first_shape_error: float = 0.0
-    lost: bool = False
+    has_gaps: bool = False
     frozen: bool = False
     has_robot_points: bool = False
     iterations: int | None = None
@@ -100,6 +101,7 @@ class RigRecording:
         faults: each with its size and unit.
         truth: true values by the name of the fitted parameter.
         noise_std: true standard deviation of a point along the ray, slow bias included [m].
+        vertices: [T, V, 3] m, where the recording's vertices truly were when the light of each cloud came.
         iterations: after which the search is cut short; None: it is not.
     """
 
@@ -108,6 +110,7 @@ class RigRecording:
     faults: dict[str, str]
     truth: dict[str, float]
     noise_std: float
+    vertices: Array
     iterations: int | None
 
 
@@ -150,9 +153,9 @@ def _camera(rig: Rig, rng: np.random.Generator, size: MeshSize) -> str:
     return f"{1e3 * CAMERA_SHIFT_M:.0f} mm"
 
 
-def _lost(rig: Rig, rng: np.random.Generator, size: MeshSize) -> str:
-    rig.lost = True
-    return f"{GAP_FRAMES} in a row and {100 * LOST_FRACTION:.0f} %"
+def _drop_frames(rig: Rig, rng: np.random.Generator, size: MeshSize) -> str:
+    rig.has_gaps = True
+    return f"{GAP_FRAMES} in a row and {100 * DROPPED_FRACTION:.0f} %"
 
 
 def _frozen(rig: Rig, rng: np.random.Generator, size: MeshSize) -> str:
@@ -171,7 +174,7 @@ def _coarse(rig: Rig, rng: np.random.Generator, size: MeshSize) -> str:
 
 
 def _start(rig: Rig, rng: np.random.Generator, size: MeshSize) -> str:
-    factor = START_FACTOR ** rng.choice([-1, 1])
+    factor = START_ERROR_FACTOR ** rng.choice([-1, 1])
     sheet = rig.nominal.sheet
     stiffness = factor * rig.scene.sheet.membrane_stiffness
     rig.nominal = replace(rig.nominal, sheet=replace(sheet, membrane_stiffness=stiffness))
@@ -190,7 +193,7 @@ FAULTS: dict[str, Callable[[Rig, np.random.Generator, MeshSize], str]] = {
     "first shape": _first_shape,
     "density": _density,
     "camera": _camera,
-    "lost frames": _lost,
+    "lost frames": _drop_frames,
     "frozen frames": _frozen,
     "robot points": _robot_points,
     "coarse mesh": _coarse,
@@ -233,7 +236,13 @@ def make_rig_recording(seed: int, size: MeshSize | None = None) -> RigRecording:
     result = simulate(scene, motion)
     recording = make_recording(scene, motion, result, motion_name, seed, rig.nodes, data_sheet_scene=rig.nominal)
     recording = _without_extras(_with_first_shape_error(_with_grip_errors(recording, rng), rig, rng))
-    points = _with_cloud_faults(recording.require("points"), recording, rig, rng)
+    clouds = recording.require("points")
+    points, shots = _with_cloud_faults(clouds, recording, rig, rng)
+    # before the motion the cloth is at rest
+    light_times = np.maximum(clouds.t[shots] - rig.lag, motion.t[0])
+    frames = CubicSpline(motion.t, result.x)(light_times)
+    true_sheet, uv = scene.aligned_to_patches.sheet, np.asarray(recording.cloth.uv)
+    vertices = np.stack([interpolate_bilinear(true_sheet, x, uv)[0] for x in frames])
     sheet = rig.scene.sheet
     truth = {
         "membrane_stiffness": sheet.membrane_stiffness,
@@ -242,7 +251,8 @@ def make_rig_recording(seed: int, size: MeshSize | None = None) -> RigRecording:
         "air.normal": rig.scene.air.normal,
     }
     noise_std = float(np.hypot(sensor.noise, sensor.bias))
-    return RigRecording(replace(recording, points=points), motion_name, faults, truth, noise_std, rig.iterations)
+    recording = replace(recording, points=points)
+    return RigRecording(recording, motion_name, faults, truth, noise_std, vertices, rig.iterations)
 
 
 def _draw_rig(rng: np.random.Generator, size: MeshSize) -> Rig:
@@ -289,12 +299,12 @@ def _with_first_shape_error(recording: Recording, rig: Rig, rng: np.random.Gener
     knots = rng.standard_normal((SHAPE_ERROR_NODES**2, 3))
     if not rig.first_shape_error:
         return recording
-    cloth = recording.cloth
+    cloth, uv = recording.cloth, np.asarray(recording.cloth.uv)
     coarse = SheetSpec(SHEET_SIDE_M, SHEET_SIDE_M, nodes=(SHAPE_ERROR_NODES, SHAPE_ERROR_NODES))
-    error = interpolate_bilinear(coarse, knots, cloth.uv)[0]
+    error = interpolate_bilinear(coarse, knots, uv)[0]
     error *= rig.first_shape_error / np.sqrt((error**2).sum(-1).mean())
-    places = np.concatenate([grasp.uv for grasp in recording.grasps.values()])
-    distance = np.linalg.norm(cloth.uv[:, None] - places, axis=-1).min(1)
+    places = np.concatenate([np.asarray(grasp.uv) for grasp in recording.grasps.values()])
+    distance = np.linalg.norm(uv[:, None] - places, axis=-1).min(1)
     error *= np.clip((distance - GRIP_RADIUS_M) / GRIP_RADIUS_M, 0, 1)[:, None]
     return replace(recording, cloth=replace(cloth, initial_vertices=cloth.initial_vertices + error))
 
@@ -307,13 +317,16 @@ def _without_extras(recording: Recording) -> Recording:
     )
 
 
-def _with_cloud_faults(clouds: PointClouds, recording: Recording, rig: Rig, rng: np.random.Generator) -> PointClouds:
+def _with_cloud_faults(
+    clouds: PointClouds, recording: Recording, rig: Rig, rng: np.random.Generator
+) -> tuple[PointClouds, Array]:
+    """Return the clouds with their faults, and which of the sensor's shots [T] each one is."""
     if rig.has_robot_points:
         clouds = _add_finger_points(clouds, recording, rng)
     frames = len(clouds)
-    frozen, lost = (int(first) for first in rng.integers(frames // 4, frames - GAP_FRAMES - 2, 2))
+    frozen, gap = (int(first) for first in rng.integers(frames // 4, frames - GAP_FRAMES - 2, 2))
+    source = np.arange(frames)
     if rig.frozen:
-        source = np.arange(frames)
         source[frozen : frozen + GAP_FRAMES] = frozen
         shots = np.split(clouds.xyz, np.cumsum(clouds.counts)[:-1])
         clouds = PointClouds(clouds.t, np.concatenate([shots[i] for i in source]), clouds.counts[source])
@@ -323,12 +336,12 @@ def _with_cloud_faults(clouds: PointClouds, recording: Recording, rig: Rig, rng:
         steps = np.maximum(np.diff(late), MIN_STAMP_STEP_S)
         stamps = np.maximum(late[0], 0.0) + np.concatenate([[0.0], np.cumsum(steps)])
         clouds = PointClouds(stamps, clouds.xyz, clouds.counts)
-    if rig.lost:
-        remains = rng.random(frames) >= LOST_FRACTION
-        remains[lost : lost + GAP_FRAMES] = False
+    if rig.has_gaps:
+        remains = rng.random(frames) >= DROPPED_FRACTION
+        remains[gap : gap + GAP_FRAMES] = False
         remains[0] = True
-        clouds = clouds.select(remains)
-    return clouds
+        clouds, source = clouds.select(remains), source[remains]
+    return clouds, source
 
 
 def _add_finger_points(clouds: PointClouds, recording: Recording, rng: np.random.Generator) -> PointClouds:
