@@ -332,9 +332,7 @@ def _assemble_result(
     )
 
 
-def _find_misfit(
-    used: Objective, final: levenberg_marquardt.Iterate, fit: Mapping[str, Any], noise_std: float
-) -> str:
+def _find_misfit(used: Objective, final: levenberg_marquardt.Iterate, fit: Mapping[str, Any], noise_std: float) -> str:
     """Return why the fit is too far from the points to say anything, and what may be the reason; empty where it is not.
 
     Args:
