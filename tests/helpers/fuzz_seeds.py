@@ -18,6 +18,7 @@ import numpy as np
 import torch
 
 from torchcloth import meshes
+from torchcloth import recordings as rec
 from torchcloth.meshes import obj
 from torchcloth.recordings.files import save_npz
 
@@ -139,6 +140,7 @@ def write_seeds(folder: Path) -> None:
         **{f"npz/{name}": make_npz(arrays) for name, arrays in make_arrays().items()},
         "mcap/bag": make_bag("mcap"),
         "mcap/checksums": make_bag("mcap", checksums=True),
+        "mcap/of_our_own_writer": make_own_mcap(),
         "sqlite/bag": make_bag("sqlite3"),
         "rosbag1/bag": make_bag("ros1"),
     }
@@ -261,6 +263,15 @@ def make_bag(storage: str, *, checksums: bool = False) -> bytes:
         if checksums:
             mcap_checksums.write_checksums(file)
         return file.read_bytes()
+
+
+def make_own_mcap() -> bytes:
+    """Make a file that carries its scene and small files beside standard messages."""
+    from torchcloth.recordings import formats
+    from torchcloth.training.validation.fuzz.targets import prepared_episode
+
+    with tempfile.TemporaryDirectory() as folder:
+        return formats.write_mcap(rec.read(prepared_episode(), with_truth=True), Path(folder) / "own.mcap").read_bytes()
 
 
 def make_messages(store, is_ros1: bool):

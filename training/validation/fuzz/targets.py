@@ -22,6 +22,7 @@ from torchcloth.errors import RecordingError
 from torchcloth.meshes import obj
 from torchcloth.recordings import formats, reading, streams
 from torchcloth.recordings.files import Folder
+from torchcloth.recordings.formats.ros2_topics import SCENE_TOPIC
 from torchcloth.recordings.images import import_pillow
 from torchcloth.robots import load as load_arm  # pyright: ignore[reportMissingImports] - mapped from robots/
 from torchcloth.schemas import check_structure
@@ -256,7 +257,8 @@ def _read_bag(name: str, data: bytes) -> None:
     scene = scratch_folder() / "scene.json"
     if not scene.exists():
         scene.write_text(json.dumps(BAG_SCENE))
-    invariants.check_recording(formats.read(write_input(name, data), scene=scene))
+    has_own_scene = SCENE_TOPIC.encode() in data
+    invariants.check_recording(formats.read(write_input(name, data), scene=None if has_own_scene else scene))
 
 
 @register_format("mcap", mutations.mutate_mcap, READING, "rosbags.rosbag2", "rosbags.serde")
