@@ -41,7 +41,7 @@ class SolverSettings:
     max_trials: int = 6
     min_gain_ratio: float = 0.1
     max_misled_steps: int = 4
-    max_small_steps: int = 5
+    max_small_steps: int = 2
     broyden_tolerance: float = 0.1
 
 
