@@ -44,7 +44,7 @@ def test_noise_of_readings_and_what_lasts_are_told_apart(lasting):
     problem, episode = toy(lasting)
     split = split_residuals(solve(problem), episode)
     assert math.sqrt(split.total) == pytest.approx(math.hypot(NOISE_M, lasting), rel=0.25)
-    assert math.sqrt(split.lasting) == pytest.approx(lasting, rel=0.5, abs=0.05 * NOISE_M)
+    assert math.sqrt(split.shared) == pytest.approx(lasting, rel=0.5, abs=0.05 * NOISE_M)
 
 
 def test_a_single_frame_shows_no_difference_so_all_of_it_may_last():
@@ -52,7 +52,7 @@ def test_a_single_frame_shows_no_difference_so_all_of_it_may_last():
     at = solve(problem)
     one = at._replace(linear=at.linear._replace(frame=torch.zeros_like(at.linear.frame)))
     split = split_residuals(one, episode)
-    assert float(split.lasting) == float(split.total)
+    assert float(split.shared) == float(split.total)
 
 
 def test_errors_that_follow_the_cloth_are_covered():
@@ -65,7 +65,7 @@ def test_errors_that_follow_the_cloth_are_covered():
         slope = problem.model(torch.ones(1, dtype=torch.float64))
         problem.data = problem.data + scale[problem.patch] * slope.sign()
         at = solve(problem)
-        variance = misfit_variance(problem.problem(), at, episode, split_residuals(at, episode).lasting)
+        variance = misfit_variance(problem.problem(), at, episode, split_residuals(at, episode).shared)
         hits.append(abs(float(at.raw) - 0.5) < 1.96 * float(variance) ** 0.5)
     assert sum(hits) / len(hits) >= 0.9
 

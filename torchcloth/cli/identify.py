@@ -332,11 +332,13 @@ def _report(options: argparse.Namespace, fit: Identification, cloth: Cloth, reco
     from ..identification.pictures import save_fit_pictures
     from ..identification.result import IDENTIFICATION_FILE_NAME
     from ..identification.tables import print_fit
+    from ..inspection.corrections import check_all
 
     folder = options.out
     note = replacement_note(folder / IDENTIFICATION_FILE_NAME)
     path = fit.save(folder, options.model)
-    pictures = save_fit_pictures(fit, [build_episode(cloth, r) for r in recordings], cloth.mesh.faces, folder)
+    used = check_all(recordings)[0] if options.checks else recordings  # the clouds that were fitted
+    pictures = save_fit_pictures(fit, [build_episode(cloth, r) for r in used], cloth.mesh.faces, folder)
     clear_store(folder / PROGRESS_FOLDER_NAME)
     print_fit(fit)
     print(f"result:   {path}{note}")

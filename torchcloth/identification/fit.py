@@ -33,7 +33,7 @@ from .residuals.blocks import select_blocks
 from .residuals.metrics import distance_metrics, force_rms
 from .residuals.rigid_carry import carry_rigidly, find_unbeaten_null, mean_forces, zero_forces
 from .result import Identification
-from .uncertainty.consider_covariance import lasting_misfit, solution_covariance
+from .uncertainty.consider_covariance import shared_misfit, solution_covariance
 from .uncertainty.estimates import apply_profiles, make_estimates, make_nuisance_estimates, withdraw_estimates
 from .uncertainty.identifiability import describe_influences, find_combinations
 from .uncertainty.likely_reasons import describe_reasons, rank_reasons
@@ -401,7 +401,7 @@ def _force_entries(full: Objective, start: list[Frames], end: list[Frames]) -> d
 
 def _observation_entries(full: Objective, final: levenberg_marquardt.Iterate) -> dict[str, float]:
     """Effective number of observations, and the residuals' standard deviation for each kind of data."""
-    entries, total, misfit = {}, 0.0, lasting_misfit(full, final)
+    entries, total, misfit = {}, 0.0, shared_misfit(full, final)
     for b, block in enumerate(full.blocks):
         residual = final.linear.residual[final.linear.blocks == b]
         residual = residual[residual != 0]

@@ -36,7 +36,7 @@ def solution_covariance(objective: Objective, checked: LinearityCheck, strata: T
     sampled = checked.covariance
     covariance = levenberg_marquardt.covariance(problem, final) if sampled is None else sampled
     episode = objective.episode_of_rows(final.linear)
-    variances = covariance.diagonal() + misfit_variance(problem, final, episode, lasting_misfit(objective, final))
+    variances = covariance.diagonal() + misfit_variance(problem, final, episode, shared_misfit(objective, final))
     covariance = levenberg_marquardt.inflate_covariance(covariance, variances)
     if count >= MIN_REPLICATES:
         strata = torch.zeros(count, dtype=torch.int64) if strata is None else strata
@@ -53,15 +53,15 @@ def solution_covariance(objective: Objective, checked: LinearityCheck, strata: T
     return add_initial_shape_noise(objective, final, covariance)
 
 
-def lasting_misfit(objective: Objective, at: levenberg_marquardt.Iterate) -> Tensor:
-    """Compute the mean square [B] of the misfit that lasts from frame to frame, for every block.
+def shared_misfit(objective: Objective, at: levenberg_marquardt.Iterate) -> Tensor:
+    """Compute the mean square [B] of the misfit that readings of a part of the fabric share, for every block.
 
     Where the noise of the points is stated, it includes what is slow, and only what exceeds it is misfit.
     """
     split = split_residuals(at, objective.episode_of_rows(at.linear))
     stated = torch.tensor([objective.stated_noise(b) for b in objective.blocks]).to(split.total)[: len(split.total)]
     excess = (split.total - stated.square()).clamp(min=0.0)
-    return torch.where(stated > 0, torch.minimum(split.lasting, excess), split.lasting)
+    return torch.where(stated > 0, torch.minimum(split.shared, excess), split.shared)
 
 
 def add_initial_shape_noise(objective: Objective, final: levenberg_marquardt.Iterate, covariance: Tensor) -> Tensor:

@@ -1,0 +1,70 @@
+"""A fit far above the noise identifies nothing, and the fault that made it is named."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from helpers import twins
+
+from torchcloth.identification import identify
+from torchcloth.identification.uncertainty.likely_reasons import Reason, describe_reasons
+from torchcloth.identification.uncertainty.misfit import find_misfit
+
+CAMERA_SHIFT_M, JITTER_S = 0.012, 0.03
+PARAMETERS = ["youngs_modulus", "air.normal"]
+
+
+def shift_camera(recording):
+    points = recording.points
+    return replace(recording, points=replace(points, xyz=points.xyz + np.array([CAMERA_SHIFT_M, 0.0, CAMERA_SHIFT_M])))
+
+
+def jitter_stamps(recording):
+    """Every second frame is stamped too early, and every other one too late."""
+    points = recording.points
+    late = JITTER_S * np.where(np.arange(len(points.t)) % 2, 1.0, -1.0)
+    late[[0, -1]] = 0.0
+    return replace(recording, points=replace(points, t=np.sort(points.t + late)))
+
+
+@pytest.fixture(scope="module", params=[(shift_camera, "the camera's pose"), (jitter_stamps, "single stamps")])
+def faulty(request, recording):
+    """(result, words of the reason) of a recording without a stated noise."""
+    make, reason = request.param
+    with twins.use_float64():
+        stranger = replace(make(recording), observation_noise_std=None)
+        fit = identify(twins.build_cloth_at(recording, youngs_modulus=4e4), stranger, PARAMETERS, checks=False)
+    return fit, reason
+
+
+def test_a_fit_far_above_the_noise_identifies_nothing(faulty):
+    fit, _ = faulty
+    assert fit.fit["points_misfit"] > 3 * fit.fit["points_noise"]
+    assert not any(fit.parameters[name].identifiable for name in PARAMETERS)
+
+
+def test_the_likeliest_reason_is_named_first(faulty):
+    fit, reason = faulty
+    (statement,) = (w for w in fit.warnings if "does not describe these data" in w)
+    assert statement.partition("what would explain most of it: ")[2].startswith(reason)
+
+
+def test_a_good_fit_has_no_misfit(plain):
+    assert plain.fit["points_misfit"] < plain.fit["points_noise"]
+    assert not any("does not describe" in w for w in plain.warnings)
+
+
+def test_the_limits_of_misfit():
+    assert find_misfit(3.1e-3, 1e-3, 0.5)
+    assert not find_misfit(2.9e-3, 1e-3, 0.5)
+    assert not find_misfit(2.9e-3, 1e-5, 0.5)  # no model of cloth is exact to less than a millimetre
+    assert "farther from the points than it began" in find_misfit(1e-4, 1e-3, 1.2)
+
+
+def test_small_shares_are_no_reason():
+    text = describe_reasons([Reason("grasp", 0.1), Reason("clock", 0.0)])
+    assert "diagnose" in text
+    text = describe_reasons([Reason("grasp", 0.6), Reason("clock", 0.2), Reason("shape", 0.01)])
+    assert text.startswith("what would explain most of it: the grip (60 %), a lag")
+    assert "--nuisance grasp" in text
+    assert "first shape" not in text
