@@ -29,8 +29,10 @@ def test_clouds_with_late_stamps_and_no_stated_noise(recording, model, lag):
     check_truth_is_within(fit)
 
 
-def test_a_start_ten_times_too_stiff(recording):
-    """Reported: E was 0.927 ± 0.019 of the truth, and identifiable."""
-    nominal = {**recording.cloth.nominal, "membrane_stiffness": 10 * MEMBRANE}
+@pytest.mark.filterwarnings("ignore:settle")  # a hundred times too soft, the cloth still moves
+@pytest.mark.parametrize("factor", [0.01, 10.0, 100.0])
+def test_a_start_one_or_two_decades_off(recording, factor):
+    """Reported: from 10 times E was 0.927 ± 0.019 of the truth, and identifiable."""
+    nominal = {**recording.cloth.nominal, "membrane_stiffness": factor * MEMBRANE}
     far = replace(recording, observation_noise_std=None, cloth=replace(recording.cloth, nominal=nominal))
     check_truth_is_within(identify(twins.build_cloth_at(far), far, NAMES))
