@@ -344,7 +344,7 @@ def _find_misfit(used: Objective, final: levenberg_marquardt.Iterate, fit: Mappi
     if "points_misfit" not in fit:
         return ""
     over_start = fit["chamfer_after"] / fit["chamfer_before"] if fit["chamfer_before"] > 0 else 0.0
-    misfit = find_misfit(fit["points_misfit"], noise_std, over_start)
+    misfit = find_misfit(fit["points_misfit"], noise_std, over_start, final.converged)
     return misfit and f"{misfit}; {describe_reasons(rank_reasons(used, final))}"
 
 

@@ -94,6 +94,10 @@ class Objective:
         """Return the objective with other nuisances."""
         return self._with_episodes(self.episodes, nuisances)
 
+    def with_cloth(self, cloth: Cloth) -> Objective:
+        """Return the objective of another model with the same unknowns and vertices; it has no journal."""
+        return Objective(cloth, self.unknowns, self.episodes, self.dt, self.nuisances, self.blocks, self.noise_floors)
+
     def _with_episodes(self, episodes: Sequence[Episode], nuisances: Sequence[AbstractNuisance]) -> Objective:
         other = Objective(self.cloth, self.unknowns, episodes, self.dt, nuisances, self.blocks, self.noise_floors)
         other.journal = self.journal

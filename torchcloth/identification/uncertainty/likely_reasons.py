@@ -2,6 +2,9 @@
 
 Each kind of error is linearised at the solution and fitted to the residuals together with the parameters, against a
 wide prior. Its share is the decrease of the weighted sum of squares, less what as many numbers would remove of noise.
+
+A grip that yields has no slope: it holds fewer vertices than the recording says. Its direction is the difference that
+the end of this range makes, where each gripper holds the innermost vertices of its patch alone, as a hinge does.
 """
 
 from __future__ import annotations
@@ -12,6 +15,10 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from ...boundaries import Grasp
+from ...cloth import Cloth
+from ...episodes.world import rebuild_cloth
+from ...errors import SimulationDiverged, UnstableStep
 from ..estimators import levenberg_marquardt
 from ..estimators.objective import Objective
 from ..nuisances import AbstractNuisance, CameraOffset, ClockOffset, GraspOffset, InitialShapeOffset
@@ -24,15 +31,17 @@ LARGE_LAG_S, LARGE_CAMERA_ERROR_M, LARGE_GRIP_ERROR_M, LARGE_SHAPE_ERROR_M, LARG
     1e-2,
     0.03,
 )
-JITTER = "jitter"
+LARGE_YIELD = 1.0  # of the way from a clamp to a hinge
+JITTER, YIELDING_GRIP = "jitter", "yielding grip"
 REASON_WORDS = {
-    "clock": "a lag of the stamps, or a grip that yields",
+    "clock": "a lag of the stamps",
+    YIELDING_GRIP: "the grip, which yields or turns as a hinge",
     JITTER: "single stamps that are off",
     "camera": "the camera's pose",
     "grasp": "the grip",
     "shape": "the first shape",
 }
-REASON_REMEDIES = {name: f"--nuisance {name}" for name in REASON_WORDS if name != JITTER}
+REASON_REMEDIES = {name: f"--nuisance {name}" for name in REASON_WORDS if name not in (JITTER, YIELDING_GRIP)}
 MIN_REASON_SHARE = 0.15  # of the misfit, from which a reason is named
 
 
@@ -84,6 +93,16 @@ def rank_reasons(objective: Objective, final: levenberg_marquardt.Iterate) -> li
         gain = _decrease(linear.jacobian[:, columns], linear.residual, weight, precision)
         gain -= _decrease(linear.jacobian[:, is_fitted], linear.residual, weight, without)
         reasons.append(Reason(candidate.name, gain / total))
+    hinged = _residuals_of_hinges(objective, final)
+    if hinged is not None:
+        fitted_columns = linear.jacobian[:, is_fitted]
+        is_missing = (hinged == 0) | (linear.residual == 0)  # a piece of the rim that was not seen
+        column = torch.where(is_missing, 0.0, hinged - linear.residual)[:, None]
+        without = wider.prior_std[is_fitted] ** -2
+        precision = torch.cat([without, without.new_tensor([LARGE_YIELD**-2])])
+        gain = _decrease(torch.cat([fitted_columns, column], 1), linear.residual, weight, precision)
+        gain -= _decrease(fitted_columns, linear.residual, weight, without)
+        reasons.append(Reason(YIELDING_GRIP, gain / total))
     for nuisance in [n for n in wider.nuisances if n.name == ClockOffset.name]:
         clock = linear.jacobian[:, torch.tensor([name == nuisance.name for name in names])].sum(1)
         reasons.append(Reason(JITTER, _jitter_decrease(clock, linear.residual, weight, linear.frame) / total))
@@ -98,6 +117,43 @@ def describe_reasons(reasons: Sequence[Reason]) -> str:
     shares = ", ".join(f"{REASON_WORDS[reason.name]} ({100 * reason.share:.0f} %)" for reason in named)
     remedy = REASON_REMEDIES.get(named[0].name, "")
     return f"what would explain most of it: {shares}" + (f"; {remedy} fits it" if remedy else "")
+
+
+def hold_innermost(cloth: Cloth) -> Cloth:
+    """Return the cloth with every grasp reduced to the innermost of its vertices, which are farthest from free ones.
+
+    Rings of vertices that share a triangle with a free one are taken away, as long as any are left.
+    """
+    boundaries = {
+        name: part.with_vertices(_innermost(part.index, torch.as_tensor(cloth.mesh.faces).long()))
+        for name, part in cloth.boundaries.items()
+        if isinstance(part, Grasp)
+    }
+    return rebuild_cloth(cloth, {}, None, boundaries)
+
+
+def _innermost(held: Tensor, faces: Tensor) -> Tensor:
+    """Innermost of the vertices [H], which are gripped, of triangles [F, 3]."""
+    inner = held
+    while len(inner):
+        held, is_held = inner, torch.isin(faces, inner)
+        inner = held[~torch.isin(held, faces[~is_held.all(1)])]
+        if len(inner) == len(held):  # all of a piece is gripped
+            break
+    return held
+
+
+def _residuals_of_hinges(objective: Objective, final: levenberg_marquardt.Iterate) -> Tensor | None:
+    """Residuals [R] at the solution where grippers hold as hinges; None where that is no other or no stable model."""
+    cloth = hold_innermost(objective.cloth)
+    grasps = {name: part for name, part in cloth.boundaries.items() if isinstance(part, Grasp)}
+    if all(torch.equal(part.index, objective.cloth.boundaries[name].index) for name, part in grasps.items()):
+        return None
+    try:
+        residual = objective.with_cloth(cloth).evaluate(final.raw)[0]
+    except (SimulationDiverged, UnstableStep):
+        return None
+    return residual if len(residual) == len(final.linear.residual) else None
 
 
 def _column_names(objective: Objective) -> list[str]:

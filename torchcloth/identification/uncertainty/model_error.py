@@ -31,6 +31,7 @@ class ModelErrors:
 
 
 MODEL_ERRORS = ModelErrors()
+SAME_SIMULATOR = ModelErrors(bending=0.0, other=0.0)  # of recordings that this library simulated, with the same laws
 
 
 def add_model_error(
