@@ -17,7 +17,7 @@ import torchcloth as tc
 from torchcloth import identification
 from torchcloth import recordings as rec
 from torchcloth.episodes.unknowns import find_scalar_parameters
-from torchcloth.identification.uncertainty.model_error import ModelErrors
+from torchcloth.identification.uncertainty.model_error import SAME_SIMULATOR as SAME_SIMULATOR
 from torchcloth.robots import replay
 
 SIDE_M = 0.3
@@ -29,7 +29,6 @@ TRUTH_RESOLUTION, FIT_RESOLUTION = (11, 11), (7, 7)  # vertices along the sides
 NOISE_M = 1e-3
 FRAME_COUNT, FRAME_RATE_HZ = 15, 20.0  # 0.7 s
 POINTS_PER_FRAME = 120
-SAME_SIMULATOR = ModelErrors(bending=0.0, other=0.0)
 
 
 @dataclass(frozen=True)
