@@ -6,11 +6,14 @@ import numpy as np
 import pytest
 from helpers import twins
 
+from torchcloth.boundaries import Grasp
+from torchcloth.episodes.world import rebuild_cloth
 from torchcloth.identification import identify
-from torchcloth.identification.uncertainty.likely_reasons import Reason, describe_reasons
+from torchcloth.identification.uncertainty.likely_reasons import Reason, describe_reasons, hold_innermost
 from torchcloth.identification.uncertainty.misfit import find_misfit
 
 CAMERA_SHIFT_M, JITTER_S = 0.012, 0.03
+EDGE_M = twins.SIDE_M / (twins.FIT_RESOLUTION[0] - 1)
 PARAMETERS = ["youngs_modulus", "air.normal"]
 
 
@@ -27,13 +30,31 @@ def jitter_stamps(recording):
     return replace(recording, points=replace(points, t=np.sort(points.t + late)))
 
 
-@pytest.fixture(scope="module", params=[(shift_camera, "the camera's pose"), (jitter_stamps, "single stamps")])
+def clamp_two_rows(cloth):
+    """The model holds two rows of vertices on each side, of which the outer one was held."""
+    u = np.asarray(cloth.mesh.uv)[:, 0]
+    grasps = {
+        name: Grasp(vertices=np.flatnonzero(np.abs(u - edge) < 1.5 * EDGE_M).tolist())
+        for name, edge in twins.GRASPED_EDGES_U_M.items()
+    }
+    return rebuild_cloth(cloth, {}, None, grasps)
+
+
+@pytest.fixture(
+    scope="module",
+    params=[
+        (shift_camera, None, "the camera's pose"),
+        (jitter_stamps, None, "single stamps"),
+        pytest.param((None, clamp_two_rows, "the grip"), marks=pytest.mark.slow),
+    ],
+)
 def faulty(request, recording):
     """(result, words of the reason) of a recording without a stated noise."""
-    make, reason = request.param
+    spoil, misread, reason = request.param
     with twins.use_float64():
-        stranger = replace(make(recording), observation_noise_std=None)
-        fit = identify(twins.build_cloth_at(recording, youngs_modulus=4e4), stranger, PARAMETERS, checks=False)
+        stranger = replace(spoil(recording) if spoil else recording, observation_noise_std=None)
+        cloth = twins.build_cloth_at(recording, youngs_modulus=4e4)
+        fit = identify(misread(cloth) if misread else cloth, stranger, PARAMETERS, checks=False)
     return fit, reason
 
 
@@ -70,3 +91,14 @@ def test_small_shares_are_no_reason():
     assert text.startswith("what would explain most of it: the grip (60 %), a lag")
     assert "--nuisance grasp" in text
     assert "first shape" not in text
+
+
+def test_a_hinge_holds_the_innermost_vertices(model):
+    hinged = hold_innermost(clamp_two_rows(model))
+    for name, part in hinged.boundaries.items():
+        assert part.index.tolist() == model.boundaries[name].index.tolist()
+
+
+def test_a_row_of_vertices_has_no_innermost_one(model):
+    for name, part in hold_innermost(model).boundaries.items():
+        assert part.index.tolist() == model.boundaries[name].index.tolist()

@@ -3,8 +3,8 @@
 Each kind of error is linearised at the solution and fitted to the residuals together with the parameters, against a
 wide prior. Its share is the decrease of the weighted sum of squares, less what as many numbers would remove of noise.
 
-A grip that yields has no slope: it holds fewer vertices than the recording says. Its direction is the difference that
-the end of this range makes, where each gripper holds the innermost vertices of its patch alone, as a hinge does.
+A grip may be off, and it may yield: then it holds less than the recording says. How much it holds is no smooth number.
+Its direction is the difference that a hinge makes, where each gripper holds the innermost vertices of its patch alone.
 """
 
 from __future__ import annotations
@@ -32,16 +32,18 @@ LARGE_LAG_S, LARGE_CAMERA_ERROR_M, LARGE_GRIP_ERROR_M, LARGE_SHAPE_ERROR_M, LARG
     0.03,
 )
 LARGE_YIELD = 1.0  # of the way from a clamp to a hinge
-JITTER, YIELDING_GRIP = "jitter", "yielding grip"
+JITTER = "jitter"
 REASON_WORDS = {
-    "clock": "a lag of the stamps",
-    YIELDING_GRIP: "the grip, which yields or turns as a hinge",
+    "clock": "a lag of the stamps, or a grip that yields",
     JITTER: "single stamps that are off",
     "camera": "the camera's pose",
     "grasp": "the grip",
     "shape": "the first shape",
 }
-REASON_REMEDIES = {name: f"--nuisance {name}" for name in REASON_WORDS if name not in (JITTER, YIELDING_GRIP)}
+REASON_REMEDIES = {name: f"--nuisance {name} fits it" for name in REASON_WORDS if name != JITTER} | {
+    "grasp": "--nuisance grasp fits where it is; if it turns as a hinge, state a smaller patch"
+}
+REASONS_LEAD = "what would explain most of it: "
 MIN_REASON_SHARE = 0.15  # of the misfit, from which a reason is named
 
 
@@ -85,24 +87,20 @@ def rank_reasons(objective: Objective, final: levenberg_marquardt.Iterate) -> li
     total = float((weight * linear.residual.square()).sum())
     if not total > 0:
         return []
-    reasons = []
-    for candidate in candidates:
-        columns = is_fitted | torch.tensor([name == candidate.name for name in names])
-        precision = wider.prior_std[columns] ** -2
-        without = wider.prior_std[is_fitted] ** -2
-        gain = _decrease(linear.jacobian[:, columns], linear.residual, weight, precision)
-        gain -= _decrease(linear.jacobian[:, is_fitted], linear.residual, weight, without)
-        reasons.append(Reason(candidate.name, gain / total))
-    hinged = _residuals_of_hinges(objective, final)
-    if hinged is not None:
-        fitted_columns = linear.jacobian[:, is_fitted]
-        is_missing = (hinged == 0) | (linear.residual == 0)  # a piece of the rim that was not seen
-        column = torch.where(is_missing, 0.0, hinged - linear.residual)[:, None]
-        without = wider.prior_std[is_fitted] ** -2
-        precision = torch.cat([without, without.new_tensor([LARGE_YIELD**-2])])
-        gain = _decrease(torch.cat([fitted_columns, column], 1), linear.residual, weight, precision)
-        gain -= _decrease(fitted_columns, linear.residual, weight, without)
-        reasons.append(Reason(YIELDING_GRIP, gain / total))
+    hinge = _effect_of_hinges(objective, final, linear.residual)
+
+    def decrease(columns: Tensor, with_hinge: bool) -> float:
+        jacobian, precision = linear.jacobian[:, columns], wider.prior_std[columns] ** -2
+        if with_hinge:
+            jacobian = torch.cat([jacobian, hinge[:, None]], 1)
+            precision = torch.cat([precision, precision.new_tensor([LARGE_YIELD**-2])])
+        return _decrease(jacobian, linear.residual, weight, precision)
+
+    reasons, without = [], decrease(is_fitted, with_hinge=False)
+    for name in dict.fromkeys([*(candidate.name for candidate in candidates), GraspOffset.name]):
+        columns = is_fitted | torch.tensor([column == name for column in names])
+        gain = decrease(columns, with_hinge=name == GraspOffset.name) - without
+        reasons.append(Reason(name, gain / total))
     for nuisance in [n for n in wider.nuisances if n.name == ClockOffset.name]:
         clock = linear.jacobian[:, torch.tensor([name == nuisance.name for name in names])].sum(1)
         reasons.append(Reason(JITTER, _jitter_decrease(clock, linear.residual, weight, linear.frame) / total))
@@ -116,7 +114,7 @@ def describe_reasons(reasons: Sequence[Reason]) -> str:
         return "none of lag, grip, first shape and camera explains it; `torchcloth diagnose` looks for what is missing"
     shares = ", ".join(f"{REASON_WORDS[reason.name]} ({100 * reason.share:.0f} %)" for reason in named)
     remedy = REASON_REMEDIES.get(named[0].name, "")
-    return f"what would explain most of it: {shares}" + (f"; {remedy} fits it" if remedy else "")
+    return f"{REASONS_LEAD}{shares}" + (f"; {remedy}" if remedy else "")
 
 
 def hold_innermost(cloth: Cloth) -> Cloth:
@@ -124,36 +122,38 @@ def hold_innermost(cloth: Cloth) -> Cloth:
 
     Rings of vertices that share a triangle with a free one are taken away, as long as any are left.
     """
-    boundaries = {
-        name: part.with_vertices(_innermost(part.index, torch.as_tensor(cloth.mesh.faces).long()))
-        for name, part in cloth.boundaries.items()
-        if isinstance(part, Grasp)
-    }
+    faces = torch.as_tensor(cloth.mesh.faces).long()
+    boundaries = {name: part.with_vertices(_innermost(part.index, faces)) for name, part in _grasps(cloth).items()}
     return rebuild_cloth(cloth, {}, None, boundaries)
 
 
-def _innermost(held: Tensor, faces: Tensor) -> Tensor:
-    """Innermost of the vertices [H], which are gripped, of triangles [F, 3]."""
-    inner = held
-    while len(inner):
-        held, is_held = inner, torch.isin(faces, inner)
-        inner = held[~torch.isin(held, faces[~is_held.all(1)])]
-        if len(inner) == len(held):  # all of a piece is gripped
-            break
-    return held
+def _innermost(gripped: Tensor, faces: Tensor) -> Tensor:
+    """Innermost of gripped vertices [H] in triangles [F, 3]."""
+    while True:
+        is_gripped = torch.isin(faces, gripped)
+        inner = gripped[~torch.isin(gripped, faces[~is_gripped.all(1)])]
+        if len(inner) in (0, len(gripped)):  # no ring is left, or a whole piece of cloth is gripped
+            return gripped
+        gripped = inner
 
 
-def _residuals_of_hinges(objective: Objective, final: levenberg_marquardt.Iterate) -> Tensor | None:
-    """Residuals [R] at the solution where grippers hold as hinges; None where that is no other or no stable model."""
-    cloth = hold_innermost(objective.cloth)
-    grasps = {name: part for name, part in cloth.boundaries.items() if isinstance(part, Grasp)}
-    if all(torch.equal(part.index, objective.cloth.boundaries[name].index) for name, part in grasps.items()):
-        return None
+def _effect_of_hinges(objective: Objective, final: levenberg_marquardt.Iterate, residual: Tensor) -> Tensor:
+    """Change of the residuals [R] at the solution if grippers hold as hinges; 0 where that is no other stable model."""
+    before, cloth = _grasps(objective.cloth), hold_innermost(objective.cloth)
+    if all(torch.equal(part.index, before[name].index) for name, part in _grasps(cloth).items()):
+        return torch.zeros_like(residual)
     try:
-        residual = objective.with_cloth(cloth).evaluate(final.raw)[0]
+        hinged = objective.with_cloth(cloth).evaluate(final.raw)[0]
     except (SimulationDiverged, UnstableStep):
-        return None
-    return residual if len(residual) == len(final.linear.residual) else None
+        return torch.zeros_like(residual)
+    if len(hinged) != len(residual):  # along the rim other points may count: no change is known then
+        return torch.zeros_like(residual)
+    is_missing = (hinged == 0) | (residual == 0)  # a piece of the rim that was not seen
+    return torch.where(is_missing, 0.0, hinged - residual)
+
+
+def _grasps(cloth: Cloth) -> dict[str, Grasp]:
+    return {name: part for name, part in cloth.boundaries.items() if isinstance(part, Grasp)}
 
 
 def _column_names(objective: Objective) -> list[str]:
