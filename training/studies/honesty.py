@@ -5,6 +5,8 @@ stamps, hinge or clamp, first shape, density, camera, lost or frozen frames, rob
 that is cut short). The command ``torchcloth identify`` fits every recording, as a stranger would. ``--compare`` runs
 another installation of torchcloth on the same recordings, without and with the true noise stated. On some of them
 ``torchcloth pose`` estimates every vertex, whose standard errors are compared with the true places.
+
+``--towel`` fits two recordings of a newcomer's towel instead. It hangs from a bar or from one corner as from a hinge.
 """
 
 from __future__ import annotations
@@ -26,16 +28,18 @@ from torchcloth import recordings
 from torchcloth._utils.constants import Z_95
 from torchcloth._utils.files import to_json, write_atomically, write_text
 from torchcloth.errors import InvalidInput
+from torchcloth.identification.uncertainty.likely_reasons import REASONS_LEAD
 from torchcloth.inspection.corrections import find_frozen_clouds
 
 from ..resumable import ResumableStudy, check_jobs, write_result
-from ..validation.independent.rig_recording import GRIP_RADIUS_M, MeshSize, make_rig_recording
+from ..validation.independent.rig_recording import GRIP_RADIUS_M, MeshSize, RigRecording, make_rig_recording
+from ..validation.independent.towel import TOWEL_CASES, TRUTH_NODES, make_towel_recording
 from .fabric_tables import NO_VALUE, make_table
 from .hidden_rates import Rate
 
 RIG_COUNT, FAST_RIG_COUNT = 40, 2
 POSE_COUNT, FAST_POSE_COUNT = 10, 1
-FAST_SIZE = MeshSize(truth=13, fit=9, coarse=7)
+FAST_SIZE, FAST_TOWEL_NODES = MeshSize(truth=13, fit=9, coarse=7), (13, 10)
 PARAMETER_SYMBOLS = {"membrane_stiffness": "E h", "poisson_ratio": "ν", "bending.stiffness": "B", "air.normal": "C_n"}
 MAX_STD_ERRORS = 3.0
 THIS_VERSION, NOISE_STATED, POSE_CASE = "this version", "noise stated", "pose"
@@ -49,6 +53,7 @@ def add(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--poses", type=int, metavar="N", help=f"recordings whose poses are estimated ({POSE_COUNT})")
     parser.add_argument("--first", type=int, default=0, metavar="SEED", help="seed of the first recording (0)")
     parser.add_argument("--jobs", type=int, default=1, metavar="N", help="number of fits at a time (1)")
+    parser.add_argument("--towel", action="store_true", help="two recordings of a newcomer's towel, and no rigs")
     parser.add_argument(
         "--compare",
         metavar="NAME=PYTHON",
@@ -65,6 +70,9 @@ def run(options: argparse.Namespace) -> None:
         got = f"{count}, {options.first}, {poses}"
         expected = "1 or more; 0 or more; at most as many as rigs"
         raise InvalidInput("--rigs, --first, --poses", got=got, expected=expected)
+    if options.towel:
+        run_towels(options)
+        return
     interpreters = {THIS_VERSION: sys.executable}
     if options.compare is not None:
         name, _, python = options.compare.partition("=")
@@ -99,6 +107,13 @@ def run_case(out: Path, seed: int, fast: bool, version: str, python: str) -> dic
     """Make the recording of a seed if it is missing, and fit it with one installation of torchcloth."""
     episode, truth = find_or_make_recording(out, seed, fast)
     folder = out / "fits" / case_name(seed, version)
+    return fit_recording(episode, truth, folder, version, python)
+
+
+def fit_recording(
+    episode: Path, truth: Mapping[str, Any], folder: Path, version: str, python: str = sys.executable
+) -> dict[str, Any]:
+    """Fit a recording with one installation of torchcloth, and return what it says beside what is hidden."""
     if version.endswith(NOISE_STATED):
         episode = _state_noise(episode, folder.with_name(f"{folder.name}-episode"), truth["noise_std"])
     shutil.rmtree(folder, ignore_errors=True)
@@ -158,10 +173,14 @@ def _rms(vectors: np.ndarray) -> float:
 
 def find_or_make_recording(out: Path, seed: int, fast: bool) -> tuple[Path, dict[str, Any]]:
     """Return the folder of a seed's recording, and what is hidden in it."""
-    episode = out / "episodes" / f"{seed:03d}"
-    truth_path = out / "truth" / f"{seed:03d}.json"
+    return _find_or_make(out, f"{seed:03d}", lambda: make_rig_recording(seed, FAST_SIZE if fast else None))
+
+
+def _find_or_make(out: Path, name: str, make: Callable[[], RigRecording]) -> tuple[Path, dict[str, Any]]:
+    episode = out / "episodes" / name
+    truth_path = out / "truth" / f"{name}.json"
     if not (truth_path.exists() and truth_path.with_suffix(".npy").exists()):
-        made = make_rig_recording(seed, FAST_SIZE if fast else None)
+        made = make()
         recordings.write(made.recording, episode, overwrite=True)
         truth_path.parent.mkdir(parents=True, exist_ok=True)
         with write_atomically(truth_path.with_suffix(".npy")) as part:
@@ -195,6 +214,62 @@ def run_command(python: str, arguments: Sequence[str]) -> tuple[float, str]:
             " ".join(command), got=f"exit code {process.returncode}: {message[-MAX_MESSAGE_CHARACTERS:]}"
         )
     return used.ru_utime + used.ru_stime, message.strip()[-MAX_MESSAGE_CHARACTERS:]
+
+
+# -- the towel --------------------------------------------------------------------------------------------------------
+
+
+def run_towels(options: argparse.Namespace) -> None:
+    """Fit both recordings of the towel; print and write a table."""
+    study = ResumableStudy(options.out, {"study": "honesty", "fast": options.fast})
+    study.start()
+    cases = {f"towel, {name}": partial(run_towel, options.out, name, options.fast) for name in TOWEL_CASES}
+    finished = study.run(cases, options.jobs)
+    print_towels(finished)
+    print(f"result: {write_result(options.out / 'towel.json', 'honesty', finished)}")
+
+
+def run_towel(out: Path, name: str, fast: bool) -> dict[str, Any]:
+    """Make a recording of the towel if it is missing, and fit it."""
+    nodes = FAST_TOWEL_NODES if fast else TRUTH_NODES
+    episode, truth = _find_or_make(out, f"towel-{name}", partial(make_towel_recording, name, nodes=nodes))
+    case = fit_recording(episode, truth, out / "fits" / f"towel-{name}", THIS_VERSION)
+    return {**case, "reasons": named_reasons(case.get("warnings", []))}
+
+
+def named_reasons(warnings: Sequence[str]) -> str:
+    """Return what a fit says would explain its misfit, without the remedy; empty where it says nothing."""
+    statements = [warning.partition(REASONS_LEAD)[2] for warning in warnings]
+    return next(filter(None, statements), "").partition(";")[0]
+
+
+def print_towels(cases: Mapping[str, Mapping[str, Any]]) -> None:
+    """Print the ratio to the truth of every number with its interval, and the reasons that are named."""
+    from rich.console import Console
+    from rich.markup import escape
+
+    table = make_table(
+        "Ratio to the truth where identifiable, with its 95 % interval",
+        *("case", "faults", *PARAMETER_SYMBOLS.values(), "CPU s"),
+        left=2,
+    )
+    for name, case in cases.items():
+        faults = ", ".join(f"{fault} {size}" for fault, size in case["faults"].items())
+        ratios = [_ratio_with_interval(case, parameter) for parameter in PARAMETER_SYMBOLS]
+        table.add_row(*map(escape, (name, faults, *ratios, f"{case['cpu_seconds']:.0f}")))
+    console = Console(highlight=False)
+    console.width = max(console.width, 120)
+    console.print(table)
+    for name, case in cases.items():
+        console.print(escape(f"{name}, reasons named: {case['reasons'] or NO_VALUE}"), soft_wrap=True)
+
+
+def _ratio_with_interval(case: Mapping[str, Any], name: str) -> str:
+    e, truth = case["parameters"].get(name), case["truth"][name]
+    if e is None or not e["identifiable"]:
+        return "refused" if case["refused"] else NO_VALUE
+    low, high = (end / truth for end in e["ci95"])
+    return f"{e['value'] / truth:.2f} [{low:.2f}, {high:.2f}]" + ("" if low <= 1 <= high else " !")
 
 
 # -- scores -----------------------------------------------------------------------------------------------------------

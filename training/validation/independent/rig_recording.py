@@ -235,7 +235,7 @@ def make_rig_recording(seed: int, size: MeshSize | None = None) -> RigRecording:
     motion = make_motion(motion_name, scene.sheet, heading, speed)
     result = simulate(scene, motion)
     recording = make_recording(scene, motion, result, motion_name, seed, rig.nodes, data_sheet_scene=rig.nominal)
-    recording = _without_extras(_with_first_shape_error(_with_grip_errors(recording, rng), rig, rng))
+    recording = without_extras(_with_first_shape_error(_with_grip_errors(recording, rng), rig, rng))
     clouds = recording.require("points")
     points, shots = _with_cloud_faults(clouds, recording, rig, rng)
     # before the motion the cloth is at rest
@@ -243,16 +243,19 @@ def make_rig_recording(seed: int, size: MeshSize | None = None) -> RigRecording:
     frames = CubicSpline(motion.t, result.x)(light_times)
     true_sheet, uv = scene.aligned_to_patches.sheet, np.asarray(recording.cloth.uv)
     vertices = np.stack([interpolate_bilinear(true_sheet, x, uv)[0] for x in frames])
-    sheet = rig.scene.sheet
-    truth = {
-        "membrane_stiffness": sheet.membrane_stiffness,
-        "poisson_ratio": sheet.poisson_ratio,
-        "bending.stiffness": rig.scene.plate.stiffness,
-        "air.normal": rig.scene.air.normal,
-    }
     noise_std = float(np.hypot(sensor.noise, sensor.bias))
     recording = replace(recording, points=points)
-    return RigRecording(recording, motion_name, faults, truth, noise_std, vertices, rig.iterations)
+    return RigRecording(recording, motion_name, faults, true_parameters(rig.scene), noise_std, vertices, rig.iterations)
+
+
+def true_parameters(scene: Scene) -> dict[str, float]:
+    """Return the true values of a scene by the name of the fitted parameter."""
+    return {
+        "membrane_stiffness": scene.sheet.membrane_stiffness,
+        "poisson_ratio": scene.sheet.poisson_ratio,
+        "bending.stiffness": scene.plate.stiffness,
+        "air.normal": scene.air.normal,
+    }
 
 
 def _draw_rig(rng: np.random.Generator, size: MeshSize) -> Rig:
@@ -309,7 +312,7 @@ def _with_first_shape_error(recording: Recording, rig: Rig, rng: np.random.Gener
     return replace(recording, cloth=replace(cloth, initial_vertices=cloth.initial_vertices + error))
 
 
-def _without_extras(recording: Recording) -> Recording:
+def without_extras(recording: Recording) -> Recording:
     """Leave out what a stranger does not record (forces, split, noise), and say that there is air."""
     grippers = {name: replace(m, force=None, torque=None) for name, m in recording.grippers.items()}
     return replace(

@@ -108,14 +108,18 @@ def _measure(spec: SensorSpec, points: Array, noise: Array, bias_modes: Array) -
     """Return the measured positions [N, 3] m of true points [N, 3] m."""
     ray = points - spec.position
     depth = np.linalg.norm(ray, axis=1)
-    across, up = _image_coordinates(spec, points).T
-    modes = np.stack([np.ones(len(points)), across, up, across * up, across**2, up**2])
-    modes *= (1 / BIAS_MODE_HALF_WIDTH) ** np.array([0, 1, 1, 2, 2, 2])[:, None]
-    bias = spec.bias / np.sqrt(BIAS_MODE_MEAN_SQUARES) * (bias_modes @ modes)
+    bias = spec.bias / np.sqrt(BIAS_MODE_MEAN_SQUARES) * (bias_modes @ depth_error_modes(spec, points))
     depth = depth * (1 + spec.scale) + spec.offset + spec.noise * noise + bias
     measured = ray / np.linalg.norm(ray, axis=1, keepdims=True) * depth[:, None]
     turn, position = _believed_pose(spec)
     return position + measured @ turn.T
+
+
+def depth_error_modes(spec: SensorSpec, points: Array) -> Array:
+    """Return the modes [6, N] of a slow depth error at points [N, 3] m: low-order polynomials over the image."""
+    across, up = _image_coordinates(spec, points).T
+    modes = np.stack([np.ones(len(points)), across, up, across * up, across**2, up**2])
+    return modes * (1 / BIAS_MODE_HALF_WIDTH) ** np.array([0, 1, 1, 2, 2, 2])[:, None]
 
 
 def pinhole_camera(spec: SensorSpec) -> dict[str, Any]:
