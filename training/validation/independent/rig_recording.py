@@ -101,7 +101,8 @@ class RigRecording:
         faults: each with its size and unit.
         truth: true values by the name of the fitted parameter.
         noise_std: true standard deviation of a point along the ray, slow bias included [m].
-        vertices: [T, V, 3] m, where the recording's vertices truly were when the light of each cloud came.
+        vertices: [T, V, 3] m, where the recording's vertices were when the light of each cloud came, as a camera at its
+            stated place sees them.
         iterations: after which the search is cut short; None: it is not.
     """
 
@@ -242,7 +243,9 @@ def make_rig_recording(seed: int, size: MeshSize | None = None) -> RigRecording:
     light_times = np.maximum(clouds.t[shots] - rig.lag, motion.t[0])
     frames = CubicSpline(motion.t, result.x)(light_times)
     true_sheet, uv = scene.aligned_to_patches.sheet, np.asarray(recording.cloth.uv)
-    vertices = np.stack([interpolate_bilinear(true_sheet, x, uv)[0] for x in frames])
+    angle = np.deg2rad(sensor.heading)
+    seen_shift = sensor.shift * np.array([np.cos(angle), np.sin(angle), 0.0])
+    vertices = np.stack([interpolate_bilinear(true_sheet, x, uv)[0] for x in frames]) + seen_shift
     noise_std = float(np.hypot(sensor.noise, sensor.bias))
     recording = replace(recording, points=points)
     return RigRecording(recording, motion_name, faults, true_parameters(rig.scene), noise_std, vertices, rig.iterations)
