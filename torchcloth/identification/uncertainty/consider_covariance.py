@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 
 from ...boundaries import Grasp
+from ...errors import SimulationDiverged, UnstableStep
 from ..estimators import levenberg_marquardt
 from ..estimators.linearity import LinearityCheck
 from ..estimators.objective import Objective
@@ -43,14 +44,14 @@ def solution_covariance(objective: Objective, checked: LinearityCheck, strata: T
         scatter = jackknife_variance(problem, final, episode, strata)
         scatter[len(objective.unknowns) :] = 0.0  # without its episode a nuisance has no data, and no scatter
         covariance = levenberg_marquardt.inflate_covariance(covariance, scatter)
-    if sampled is not None or checked.is_withdrawn:  # a withdrawn solution is not used
+    if checked.is_withdrawn:  # a withdrawn solution is not used
         return covariance
-    if not final.converged:  # a search that was cut short is as uncertain as the remaining step
+    if sampled is None and not final.converged:  # a search that was cut short is as uncertain as the remaining step
         gradient, hessian = levenberg_marquardt.normal_equations(problem, final)
         remaining = torch.linalg.solve(hessian, gradient)
         variances = covariance.diagonal() + remaining.square()
         covariance = levenberg_marquardt.inflate_covariance(covariance, variances)
-    return add_initial_shape_noise(objective, final, covariance)
+    return add_initial_shape_noise(objective, final, covariance, by_tangents=sampled is None)
 
 
 def shared_misfit(objective: Objective, at: levenberg_marquardt.Iterate) -> Tensor:
@@ -64,21 +65,46 @@ def shared_misfit(objective: Objective, at: levenberg_marquardt.Iterate) -> Tens
     return torch.where(stated > 0, torch.minimum(split.shared, excess), split.shared)
 
 
-def add_initial_shape_noise(objective: Objective, final: levenberg_marquardt.Iterate, covariance: Tensor) -> Tensor:
+def add_initial_shape_noise(
+    objective: Objective, final: levenberg_marquardt.Iterate, covariance: Tensor, by_tangents: bool = True
+) -> Tensor:
     """Widen a covariance [K, K] by the noise of the held vertices, as a considered parameter (Schmidt 1966).
 
     Nothing is added where the offset was fitted, or where the first shape is not measured.
+
+    Args:
+        objective: of the frames that were used.
+        final: the solution.
+        covariance: [K, K] of it.
+        by_tangents: take slopes from tangents; else from steps of one standard deviation, which mean something where
+            the motion is unstable, too.
     """
     wider, is_considered = with_grasp_offsets(objective)
     if wider is objective:
         return covariance
     raw = wider.start.clone()
     raw[~is_considered] = final.raw
-    slopes = wider.linearise(raw).jacobian[:, is_considered]
+    considered = is_considered.nonzero().squeeze(-1).tolist()
+    if by_tangents:
+        slopes = wider.linearise(raw).jacobian[:, considered]
+    else:
+        slopes = torch.stack([_finite_slope(wider, raw, k) for k in considered], 1)
     weighted = final.row_weights()[0][:, None] * final.linear.jacobian
     information = levenberg_marquardt.information_matrix(objective.problem(), final)
     sensitivity = torch.linalg.solve(information, weighted.mT @ slopes) * wider.prior_std[is_considered]
     return covariance + sensitivity @ sensitivity.mT
+
+
+def _finite_slope(objective: Objective, raw: Tensor, k: int) -> Tensor:
+    """[R] change of the residuals per unit of unknown ``k``, over a standard deviation; zero where that diverges."""
+    step = float(objective.prior_std[k])
+    shifted = raw.clone()
+    shifted[k] += step
+    here = objective.evaluate_all(raw).residual
+    try:
+        return (objective.evaluate_all(shifted).residual - here) / step
+    except (SimulationDiverged, UnstableStep):
+        return torch.zeros_like(here)
 
 
 def with_grasp_offsets(objective: Objective) -> tuple[Objective, Tensor]:
