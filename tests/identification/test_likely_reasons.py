@@ -9,7 +9,7 @@ from helpers import twins
 from torchcloth.boundaries import Grasp
 from torchcloth.episodes.world import rebuild_cloth
 from torchcloth.identification import identify
-from torchcloth.identification.uncertainty.likely_reasons import Reason, describe_reasons, hold_innermost
+from torchcloth.identification.uncertainty.likely_reasons import REASONS_LEAD, Reason, describe_reasons, hold_innermost
 from torchcloth.identification.uncertainty.misfit import find_misfit
 
 CAMERA_SHIFT_M, JITTER_S = 0.012, 0.03
@@ -67,7 +67,7 @@ def test_a_fit_far_above_the_noise_identifies_nothing(faulty):
 def test_the_likeliest_reason_is_named_first(faulty):
     fit, reason = faulty
     (statement,) = (w for w in fit.warnings if "does not describe these data" in w)
-    assert statement.partition("what would explain most of it: ")[2].startswith(reason)
+    assert statement.partition(REASONS_LEAD)[2].startswith(reason)
 
 
 def test_a_good_fit_has_no_misfit(plain):
@@ -88,7 +88,7 @@ def test_small_shares_are_no_reason():
     text = describe_reasons([Reason("grasp", 0.1), Reason("clock", 0.0)])
     assert "diagnose" in text
     text = describe_reasons([Reason("grasp", 0.6), Reason("clock", 0.2), Reason("shape", 0.01)])
-    assert text.startswith("what would explain most of it: the grip (60 %), a lag")
+    assert text.startswith(f"{REASONS_LEAD}the grip (60 %), a lag")
     assert "--nuisance grasp" in text
     assert "first shape" not in text
 

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from torchcloth import recordings
+from torchcloth.identification.uncertainty.likely_reasons import REASONS_LEAD
 from torchcloth.training.studies import honesty
 from torchcloth.training.studies.command import main
 from torchcloth.training.validation.independent.towel import TOWEL_CASES, make_towel_recording
@@ -58,6 +59,6 @@ def test_the_bar_holds_one_row_of_the_towel_and_the_recording_says_two():
 
 
 def test_reasons_are_read_from_the_warning():
-    warning = "far off; what would explain most of it: the grip (60 %), a lag (20 %); --nuisance grasp fits it"
+    warning = f"far off; {REASONS_LEAD}the grip (60 %), a lag (20 %); --nuisance grasp fits it"
     assert honesty.named_reasons(["other", warning]) == "the grip (60 %), a lag (20 %)"
     assert honesty.named_reasons(["other"]) == ""

@@ -24,13 +24,8 @@ from ..estimators.objective import Objective
 from ..nuisances import AbstractNuisance, CameraOffset, ClockOffset, GraspOffset, InitialShapeOffset
 
 # Standard deviations of wide priors: a reason may be a large error.
-LARGE_LAG_S, LARGE_CAMERA_ERROR_M, LARGE_GRIP_ERROR_M, LARGE_SHAPE_ERROR_M, LARGE_JITTER_S = (
-    0.05,
-    5e-3,
-    5e-3,
-    1e-2,
-    0.03,
-)
+LARGE_LAG_S, LARGE_JITTER_S = 0.05, 0.03
+LARGE_CAMERA_ERROR_M, LARGE_GRIP_ERROR_M, LARGE_SHAPE_ERROR_M = 5e-3, 5e-3, 1e-2
 LARGE_YIELD = 1.0  # of the way from a clamp to a hinge
 JITTER = "jitter"
 REASON_WORDS = {
@@ -43,7 +38,7 @@ REASON_WORDS = {
 REASON_REMEDIES = {name: f"--nuisance {name} fits it" for name in REASON_WORDS if name != JITTER} | {
     "grasp": "--nuisance grasp fits where it is; if it turns as a hinge, state a smaller patch"
 }
-REASONS_LEAD = "what would explain most of it: "
+REASONS_LEAD = "likeliest reasons, by the share of the misfit that each explains: "
 MIN_REASON_SHARE = 0.15  # of the misfit, from which a reason is named
 
 
@@ -108,7 +103,7 @@ def rank_reasons(objective: Objective, final: levenberg_marquardt.Iterate) -> li
 
 
 def describe_reasons(reasons: Sequence[Reason]) -> str:
-    """Return a sentence about what would explain most of a misfit."""
+    """Return a sentence about the likeliest reasons of a misfit."""
     named = [reason for reason in reasons if reason.share >= MIN_REASON_SHARE]
     if not named:
         return "none of lag, grip, first shape and camera explains it; `torchcloth diagnose` looks for what is missing"

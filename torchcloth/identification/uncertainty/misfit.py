@@ -139,7 +139,7 @@ def find_misfit(
     if misfit > limit * max(noise, criteria.min_noise_m):
         return (
             f"the model does not describe these data: whole parts of the fabric are {1e3 * misfit:.1f} mm off "
-            f"(rms), and the points have a noise of {1e3 * noise:.1f} mm; no parameter counts as identified"
+            f"(rms), and the points have a noise of {1e3 * noise:.2g} mm; no parameter counts as identified"
         )
     if chamfer_over_start > criteria.max_chamfer_over_start:
         return "the search ended farther from the points than it began; no parameter counts as identified"
