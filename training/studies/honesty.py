@@ -44,6 +44,7 @@ PARAMETER_SYMBOLS = {"membrane_stiffness": "E h", "poisson_ratio": "ν", "bendin
 MAX_STD_ERRORS = 3.0
 THIS_VERSION, NOISE_STATED, POSE_CASE = "this version", "noise stated", "pose"
 MAX_MESSAGE_CHARACTERS = 300
+UNUSABLE_POSE_WORDS = "do not use this estimate"
 REPORTED_FIT_ENTRIES = ("iterations", "simulations", "converged", "rms_after", "points_residual", "points_misfit")
 
 
@@ -144,6 +145,7 @@ def run_pose(out: Path, seed: int, fast: bool) -> dict[str, Any]:
     case = {"motion": truth["motion"], "faults": truth["faults"], "cpu_seconds": seconds}
     if not (folder / "pose.npz").exists():
         return {**case, "refused": message}
+    warnings = json.loads((folder / "pose.json").read_text())["warnings"]
     recording = recordings.read(episode)
     true_vertices = np.load(out / "truth" / f"{seed:03d}.npy")
     with np.load(folder / "pose.npz") as pose:
@@ -163,6 +165,7 @@ def run_pose(out: Path, seed: int, fast: bool) -> dict[str, Any]:
         "rms_simulated": _rms(simulated),
         "std_rms": _rms(std),
         "coverage": float((np.abs(error) < Z_95 * std).mean()),
+        "is_unusable": any(UNUSABLE_POSE_WORDS in warning for warning in warnings),
     }
 
 
@@ -365,7 +368,8 @@ def _pose_rows(poses: Mapping[int, Mapping[str, Any]]) -> list[tuple[str, ...]]:
         numbers = ("refused", *[NO_VALUE] * 4)
         if not case["refused"]:
             lengths = (f"{1e3 * case[key]:.2f}" for key in ("rms_simulated", "rms", "std_rms"))
-            numbers = (f"{case['seconds_recorded']:.1f}", *lengths, f"{100 * case['coverage']:.0f} %")
+            coverage = "says: not to be used" if case["is_unusable"] else f"{100 * case['coverage']:.0f} %"
+            numbers = (f"{case['seconds_recorded']:.1f}", *lengths, coverage)
         rows.append((*first, *numbers, f"{case['cpu_seconds']:.0f}"))
     return rows
 
