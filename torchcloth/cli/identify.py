@@ -289,7 +289,7 @@ def _fit(options: argparse.Namespace, cloth: Cloth, episodes: list[Recording]) -
 
         def advance(iteration: int, chamfer: float, values: dict[str, float], share: float) -> None:
             shown = ", ".join(f"{name} {value:.4g}" for name, value in list(values.items())[:2])
-            used = "all frames" if share == 1 else f"first {100 * share:.0f} % of the frames"
+            used = "all frames" if share == 1 else f"first {100 * share:.0f} % of frames"
             text = shown if math.isnan(chamfer) else f"Chamfer {1e3 * chamfer:.2f} mm, {shown}"
             text = ", ".join(filter(None, (used, text, timer.describe(iteration, share))))
             progress.update(task, completed=iteration, description=text)
