@@ -102,3 +102,19 @@ def test_a_hinge_holds_the_innermost_vertices(model):
 def test_a_row_of_vertices_has_no_innermost_one(model):
     for name, part in hold_innermost(model).boundaries.items():
         assert part.index.tolist() == model.boundaries[name].index.tolist()
+
+
+def test_a_nuisance_far_outside_of_its_prior_is_named(recording):
+    """A camera that is 12 mm off, fitted as an offset of the grips: these came out 10 mm off, without a word."""
+    points = recording.points
+    raised = replace(recording, points=replace(points, xyz=points.xyz + np.array([0.0, 0.0, 5e-3])))
+    model = twins.build_cloth_at(recording, youngs_modulus=4e4)
+    fit = identify(model, raised, PARAMETERS, nuisances={"grasp": 1e-3}, iterations=8, checks=False)
+    assert any("conflict with the prior" in w and "grasp.left.z" in w for w in fit.warnings)
+
+
+def test_reasons_that_are_as_likely_have_their_remedies():
+    text = describe_reasons([Reason("grasp", 0.31), Reason("camera", 0.28), Reason("clock", 0.16)])
+    assert "--nuisance grasp" in text
+    assert "--nuisance camera" in text
+    assert "--nuisance clock" not in text

@@ -26,7 +26,7 @@ from ..recordings import Recording
 from .estimators import levenberg_marquardt
 from .estimators.objective import Objective
 from .estimators.search import CHAMFER_METHODS, ESTIMATION_METHODS, Method, Outcome, Progress, Search
-from .fit_warnings import fit_warnings, warn_of_skew
+from .fit_warnings import fit_warnings, nuisance_warnings, warn_of_skew
 from .io.saved_fit import describe_model
 from .nuisances import add_lookahead, as_stds, implied_nuisances, select_nuisances
 from .residuals.blocks import select_blocks
@@ -311,6 +311,7 @@ def _assemble_result(
     fit_of_used = {**fit, "rms_after": distance_metrics(used_frames, used.episodes, full.faces).rms}
     if not full.uses("points", "markers"):  # points that were not used are reported, and decide nothing
         fit_of_used |= {"rms_after": math.nan, "chamfer_after": math.nan}
+    warnings += nuisance_warnings(full.episodes, full.nuisance_slices, final.raw)
     warnings += fit_warnings(full.cloth, full.episodes, estimates, fit_of_used, after, full.faces, unbeaten_null)
 
     return Identification(

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from ..cloth import Cloth
 from ..episodes.observed import Episode
+from .nuisances import NuisanceSlice
 from .uncertainty.estimates import EstimateSet
 
 
@@ -26,6 +27,8 @@ class WarningThresholds:
         min_layer_separation_edges: distance in the fabric between triangles of different layers, in mean edges.
         max_layer_distance_edges: distance in space at which layers meet, in mean edges.
         checked_frames: frames of each episode in which layers are looked for.
+        max_nuisance_prior_stds: distance of a nuisance from zero, in standard deviations of its prior, above which the
+            two conflict.
     """
 
     max_residual_over_noise: float = 1.3
@@ -34,6 +37,7 @@ class WarningThresholds:
     min_layer_separation_edges: float = 4
     max_layer_distance_edges: float = 1.5
     checked_frames: int = 8
+    max_nuisance_prior_stds: float = 3.0
 
 
 FIT_WARNING_THRESHOLDS = WarningThresholds()
@@ -116,6 +120,32 @@ def fit_warnings(
     warnings += [warning for e in episodes for warning in e.data_warnings()]
     if cloth.contact is None and _layers_meet(cloth, frames, faces):
         warnings.append("layers of the cloth come near each other, and contact was left out: fit with contact")
+    return warnings
+
+
+def nuisance_warnings(
+    episodes: Sequence[Episode], nuisance_slices: Sequence[Sequence[NuisanceSlice]], raw: Tensor
+) -> list[str]:
+    """Name nuisances that ended far outside of their priors: another error may look like them.
+
+    Args:
+        episodes: of the fit.
+        nuisance_slices: where their nuisances stand among the unknowns.
+        raw: [K] the solution.
+    """
+    warnings = []
+    for episode, slices in zip(episodes, nuisance_slices, strict=True):
+        for s in slices:
+            conflicts = [
+                f"{name} {value:.2g} {unit}"
+                for name, unit, std, value in zip(s.names, s.units, s.stds, raw[s.index].tolist(), strict=True)
+                if abs(value) > FIT_WARNING_THRESHOLDS.max_nuisance_prior_stds * std
+            ]
+            if conflicts:
+                warnings.append(
+                    f"{episode.name}: {', '.join(conflicts)} conflict with the prior ({s.stds[0]:.2g} {s.units[0]}): "
+                    "another error, e.g. of the camera's or the robot's pose, may look the same"
+                )
     return warnings
 
 

@@ -36,10 +36,11 @@ REASON_WORDS = {
     "shape": "the first shape",
 }
 REASON_REMEDIES = {name: f"--nuisance {name} fits it" for name in REASON_WORDS if name != JITTER} | {
-    "grasp": "--nuisance grasp fits where it is; if it turns as a hinge, state a smaller patch"
+    "grasp": "--nuisance grasp fits where it is; if it turns as a hinge, state a smaller radius"
 }
 REASONS_LEAD = "likeliest reasons, by the share of the misfit that each explains: "
 MIN_REASON_SHARE = 0.15  # of the misfit, from which a reason is named
+MIN_EQUAL_SHARE_RATIO = 0.8  # of a share to the largest one, from which a reason is as likely
 
 
 class Reason(NamedTuple):
@@ -108,8 +109,9 @@ def describe_reasons(reasons: Sequence[Reason]) -> str:
     if not named:
         return "none of lag, grip, first shape and camera explains it; `torchcloth diagnose` looks for what is missing"
     shares = ", ".join(f"{REASON_WORDS[reason.name]} ({100 * reason.share:.0f} %)" for reason in named)
-    remedy = REASON_REMEDIES.get(named[0].name, "")
-    return f"{REASONS_LEAD}{shares}" + (f"; {remedy}" if remedy else "")
+    as_likely = [reason for reason in named if reason.share > MIN_EQUAL_SHARE_RATIO * named[0].share]
+    remedies = [REASON_REMEDIES[reason.name] for reason in as_likely if reason.name in REASON_REMEDIES]
+    return "; ".join([f"{REASONS_LEAD}{shares}", *remedies])
 
 
 def hold_innermost(cloth: Cloth) -> Cloth:
