@@ -17,6 +17,7 @@ LONG_FILES = (
     "test_cli.py",
     "test_boundaries.py",
     "test_demo.py",
+    "test_honesty.py",
     "test_diagnose.py",
     "test_effects.py",
     "test_noise_screening_comparison.py",
