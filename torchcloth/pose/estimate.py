@@ -8,11 +8,12 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any, cast
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from .._utils.constants import STANDARD_GRAVITY_M_PER_S2
-from .._utils.linalg import cross, find_last_knot
+from .._utils.linalg import find_last_knot
 from .._utils.torch_modes import isolated_grad_mode
 from ..boundaries import Grasp
 from ..cloth import Cloth
@@ -27,6 +28,7 @@ from ..identification.residuals.rigid_carry import carry_rigidly
 from ..identification.uncertainty.consider_covariance import with_grasp_offsets
 from ..identification.uncertainty.estimates import make_estimates, make_nuisance_estimates
 from ..inspection.corrections import check_all
+from ..meshes.mesh import vertex_normals
 from ..recordings import Recording
 from ..recordings.consistency import check_recording
 from ..recordings.size_checks import check_size
@@ -224,7 +226,9 @@ def _standard_errors(
     variance = variance.reshape(x.shape) + considered.square().sum(0) + fine_std.square().unsqueeze(-1)
     if any(map(len, used.clouds)):
         slow_std = SLOW_DEPTH_ERROR_STD_M if stated is None else min(stated, SLOW_DEPTH_ERROR_STD_M)
-        variance = variance + slow_std**2 * _vertex_normals(x, objective.faces).square()
+        faces = objective.faces.numpy()
+        normals = torch.as_tensor(np.stack([vertex_normals(frame, faces) for frame in x.numpy()]))
+        variance = variance + slow_std**2 * normals.square()
     return variance.sqrt()
 
 
@@ -248,14 +252,6 @@ def _considered_slopes(
     response = (smoothed.covariance @ gradient).to(slopes)
     direct = slopes[is_considered] * stds.to(slopes)[:, None, None, None]
     return direct - torch.einsum("ktvc,kn->ntvc", slopes[~is_considered], response)
-
-
-def _vertex_normals(x: Tensor, faces: Tensor) -> Tensor:
-    """[T, V, 3] unit normals, weighted by area."""
-    a, b, c = x[:, faces].unbind(2)
-    return torch.nn.functional.normalize(
-        torch.zeros_like(x).index_add(1, faces.flatten(), cross(b - a, c - a).repeat_interleave(3, 1)), dim=-1
-    )
 
 
 def find_gripped_vertices(cloth: Cloth, episode: Episode) -> Tensor:

@@ -88,19 +88,19 @@ def add_initial_shape_noise(
     if by_tangents:
         slopes = wider.linearise(raw).jacobian[:, considered]
     else:
-        slopes = torch.stack([_finite_slope(wider, raw, k) for k in considered], 1)
+        here = wider.evaluate_all(raw).residual
+        slopes = torch.stack([_finite_slope(wider, raw, k, here) for k in considered], 1)
     weighted = final.row_weights()[0][:, None] * final.linear.jacobian
     information = levenberg_marquardt.information_matrix(objective.problem(), final)
     sensitivity = torch.linalg.solve(information, weighted.mT @ slopes) * wider.prior_std[is_considered]
     return covariance + sensitivity @ sensitivity.mT
 
 
-def _finite_slope(objective: Objective, raw: Tensor, k: int) -> Tensor:
-    """[R] change of the residuals per unit of unknown ``k``, over a standard deviation; zero where that diverges."""
+def _finite_slope(objective: Objective, raw: Tensor, k: int, here: Tensor) -> Tensor:
+    """[R] change of residuals ``here`` by a unit of unknown ``k``, over its prior std; zero where that diverges."""
     step = float(objective.prior_std[k])
     shifted = raw.clone()
     shifted[k] += step
-    here = objective.evaluate_all(raw).residual
     try:
         return (objective.evaluate_all(shifted).residual - here) / step
     except (SimulationDiverged, UnstableStep):
