@@ -178,7 +178,7 @@ def _make_unknown(cloth: Cloth, name: str, path: str) -> Unknown:
         # a part that declares no amplitude: its start says how large it is
         undeclared = TYPICAL_AMPLITUDES.get(attribute, max(1.0, abs(start)))
         typical = undeclared if amplitude is None else amplitude.typical
-        std = 2.0 * typical
+        std = 2.0 * max(typical, abs(start))
     return Unknown(name, f"{path}.raw", parameter, start, std, typical)
 
 
