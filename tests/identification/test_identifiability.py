@@ -28,9 +28,9 @@ def unknowns(model):
 @pytest.mark.parametrize("start_size", [0.0, 0.5, 20.0])
 def test_an_amplitudes_prior_is_as_wide_as_its_start_asks_for(model, start_size):
     """A stiff start on a data sheet may be wrong by its own size."""
-    typical = model.effects[0].amplitudes["normal"].typical
+    typical = model.effects["air"].amplitudes["normal"].typical
     with torch.no_grad():
-        model.effects[0].normal.raw.fill_(start_size * typical)
+        model.effects["air"].normal.raw.fill_(start_size * typical)
     (unknown,) = collect_unknowns(model, ("air.normal",), None)
     assert unknown.prior_std == 2.0 * max(typical, abs(unknown.start))
 
