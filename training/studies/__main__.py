@@ -1,4 +1,7 @@
-"""Run ``python -m torchcloth.training.studies``."""
+"""Run a study that the documentation cites: ``python -m torchcloth.training.studies NAME --out DIR [--fast]``.
+
+``--help`` lists the studies.
+"""
 
 import sys
 
