@@ -104,9 +104,9 @@ TRIALS = (
     ),
     Trial(
         "A7",
-        "rest of 1 s given by two knots, then 0.5 m/s",
-        "the path swings 73 mm backwards during the rest",
-        "monotone between knots that far apart",
+        "path of a hand that rests for 1 s, given by the rest's two ends, and then moves at 0.5 m/s",
+        "the interpolated hand swings 73 mm backwards during the rest",
+        "the hand rests: between given points that are 0.12 s or more apart, the path stays between the two",
         ("physics/test_motion.py::test_a_hand_whose_rest_has_two_knots_rests",),
     ),
     Trial(
@@ -118,9 +118,9 @@ TRIALS = (
     ),
     Trial(
         "A9",
-        "`RestShape(skew)` on clockwise triangles",
-        "fits -0.0300 for +0.03",
-        "independent of the winding",
+        "`RestShape` with a skew of +0.03, on a mesh that lists the corners of its triangles clockwise",
+        "a fit finds -0.0300",
+        "clockwise or not, the rest shape is the same",
         ("physics/test_rest_shape.py::test_the_true_shape_does_not_depend_on_the_winding",),
     ),
     Trial(
@@ -166,9 +166,9 @@ TRIALS = (
     ),
     Trial(
         "A15",
-        "report of `diagnose`: where a cause shows",
-        "names a motion in which the cause gains nothing, held out",
-        "only a motion that gains held out",
+        "report of `diagnose`: the motion in which a cause is most significant",
+        "a motion that the model with the cause predicts no better, if the motion is left out of the fit",
+        "one that it predicts better, if there is any",
         ("diagnosis/test_localisation.py::test_it_shows_in_a_motion_that_gains_held_out",),
     ),
     Trial(
@@ -208,9 +208,9 @@ TRIALS = (
     ),
     Trial(
         "B1",
-        "README's episode, `identify --use points`",
-        "TypeError",
-        "works, with a journal",
+        "the README's episode, fitted to its points alone: `identify --use points`",
+        "TypeError while the progress is stored",
+        "works: the progress is stored, and `--resume` reads it",
         ("identification/test_resume_store.py::test_distances_of_one_kind_of_data_are_stored",),
     ),
     Trial(
