@@ -1,26 +1,16 @@
-"""Shared fixtures: float64, and one base model."""
+"""Shared fixture: one base model."""
 
 import pytest
-import torch
+from helpers import sheet_episodes
+from helpers.twins import use_float64
 
-
-@pytest.fixture(autouse=True)
-def _doubles():
-    before = torch.get_default_dtype()
-    torch.set_default_dtype(torch.float64)
-    yield
-    torch.set_default_dtype(before)
+from torchcloth.diagnosis import build_base_model, prepare_data
 
 
 @pytest.fixture(scope="module")
 def made():
-    """The base model of ``sheets.episode()``, and its setting."""
-    from helpers import sheet_episodes
-
-    from torchcloth.diagnosis import build_base_model, prepare_data
-
-    before, recording = torch.get_default_dtype(), sheet_episodes.make_episode()
-    torch.set_default_dtype(torch.float64)
-    model = build_base_model(recording)
-    yield model, prepare_data(model, [recording])
-    torch.set_default_dtype(before)
+    """The base model of ``sheet_episodes.make_episode()``, and its setting."""
+    with use_float64():
+        recording = sheet_episodes.make_episode()
+        model = build_base_model(recording)
+        return model, prepare_data(model, [recording])

@@ -33,14 +33,6 @@ MAX_SEEDS_BYTES = 200_000
 SEARCH_SECONDS = 8
 
 
-@pytest.fixture(autouse=True)
-def _as_in_the_command():
-    before = torch.get_default_dtype()
-    torch.set_default_dtype(torch.float64)
-    yield
-    torch.set_default_dtype(before)
-
-
 def test_every_format_has_a_small_seed():
     assert SEED_OF.keys() == FORMATS.keys()
     assert sum(path.stat().st_size for path in SEEDS) < MAX_SEEDS_BYTES
