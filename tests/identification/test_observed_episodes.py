@@ -14,7 +14,8 @@ from torchcloth import recordings as rec
 from torchcloth.diagnosis.data.dataset import prepare_data
 from torchcloth.diagnosis.models.base_model import build_base_model
 from torchcloth.episodes import streams
-from torchcloth.episodes.observed import build_mesh, check_recordings, compute_initial_vertices, find_depth_camera
+from torchcloth.episodes.observed import check_recordings, find_depth_camera
+from torchcloth.episodes.recorded_cloth import build_mesh, compute_initial_vertices
 from torchcloth.episodes.unknowns import collect_unknowns, find_scalar_parameters
 from torchcloth.errors import InvalidInput, RecordingError
 from torchcloth.identification import build_cloth, build_episode, fit_fields, identify

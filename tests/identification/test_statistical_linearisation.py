@@ -9,7 +9,8 @@ import torch
 from helpers import least_squares, twins
 
 from torchcloth import recordings, synthesis
-from torchcloth.episodes.observed import build_cloth, build_episode
+from torchcloth.episodes.observed import build_episode
+from torchcloth.episodes.recorded_cloth import build_cloth
 from torchcloth.episodes.replay import Frames
 from torchcloth.episodes.unknowns import collect_unknowns
 from torchcloth.errors import SimulationDiverged

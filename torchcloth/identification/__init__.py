@@ -1,6 +1,7 @@
 """From recordings to fabric parameters with error bars."""
 
-from ..episodes.observed import Episode, build_cloth, build_episode
+from ..episodes.observed import Episode, build_episode
+from ..episodes.recorded_cloth import build_cloth
 from .episode_prediction import EpisodePrediction, predict_episode
 from .fields import FieldFit, fit_fields
 from .fit import identify

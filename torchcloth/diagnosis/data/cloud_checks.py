@@ -12,7 +12,7 @@ from scipy.optimize import linear_sum_assignment
 
 from ...boundaries import Grasp
 from ...cloth import Cloth
-from ...episodes.observed import build_cloth, compute_initial_vertices
+from ...episodes.recorded_cloth import build_cloth, compute_initial_vertices
 from ...losses import find_closest_points
 from ...recordings import Recording, size_checks
 from ...robots import replay  # pyright: ignore[reportMissingImports] - mapped from robots/ at installation

@@ -9,7 +9,7 @@ from dataclasses import replace
 import torch
 
 from ...cloth import Cloth
-from ...episodes.observed import build_cloth
+from ...episodes.recorded_cloth import build_cloth
 from ...episodes.world import BaseParameter, World, WorldModel
 from ...parameters import PhysicalParameter
 from ...recordings import Recording

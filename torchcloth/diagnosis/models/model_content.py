@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from ..._utils.unpacking import check_archive
-from ...episodes.observed import build_effects, build_material, build_mesh
+from ...episodes.recorded_cloth import build_effects, build_material, build_mesh
 from ...episodes.world import BaseParameter
 from ...errors import RecordingError, TorchclothError
 from ...recordings import ClothInfo, Collider, Recording, checks, scene

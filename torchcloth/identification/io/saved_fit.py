@@ -15,7 +15,8 @@ from torch import Tensor
 
 from ...cloth import Cloth
 from ...dynamics.contact import Contact
-from ...episodes.observed import DEFAULT_FRAME_RATE_HZ, Episode, build_cloth, build_episode
+from ...episodes.observed import DEFAULT_FRAME_RATE_HZ, Episode, build_episode
+from ...episodes.recorded_cloth import build_cloth
 from ...episodes.replay import Replay
 from ...episodes.unknowns import find_scalar_parameters
 from ...errors import InvalidInput, RecordingError, UnstableStep

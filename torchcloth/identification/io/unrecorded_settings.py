@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from ...cloth import Cloth
-from ...episodes.observed import build_cloth
+from ...episodes.recorded_cloth import build_cloth
 from ...episodes.unknowns import find_scalar_parameters
 from ...errors import TorchclothError
 from ...recordings import Recording

@@ -17,8 +17,9 @@ from torch import Tensor
 
 from ...boundaries import AbstractBoundary, Grasp
 from ...cloth import Cloth
-from ...episodes.observed import build_episode, transfer_vertices
+from ...episodes.observed import build_episode
 from ...episodes.pattern_interpolation import interpolate_on_pattern, interpolation_weights, move_vertices_to_patches
+from ...episodes.recorded_cloth import transfer_vertices
 from ...errors import InvalidInput
 from ...meshes import Mesh
 from ...meshes.patches import Patch
@@ -71,11 +72,17 @@ def refine_recording(recording: Recording, coarse: Mesh, fine: Mesh) -> Recordin
 
 
 def mesh_correction(
-    objective: Objective, final: levenberg_marquardt.Iterate, recordings: Sequence[Recording]
+    objective: Objective, final: levenberg_marquardt.Iterate, recordings: Sequence[Recording], cloth: Cloth
 ) -> Tensor:
-    """Compute the step [K] that a mesh twice as fine asks for at the solution, in unconstrained coordinates."""
+    """Compute the step [K] that a mesh twice as fine asks for at the solution, in unconstrained coordinates.
+
+    Args:
+        objective: of all frames.
+        final: the solution.
+        recordings: of the fit.
+        cloth: the objective's, on the finer mesh (``refine_cloth``).
+    """
     coarse = objective.cloth
-    cloth = refine_cloth(coarse)
     episodes = [
         build_episode(cloth, refine_recording(r, coarse.mesh, cloth.mesh)).with_lookahead(e.lookahead)
         for r, e in zip(recordings, objective.episodes, strict=True)
