@@ -6,13 +6,13 @@ from types import SimpleNamespace
 import pytest
 from helpers import linear_evidence as toys
 
-from torchcloth.diagnosis.decide import backward_elimination, candidates, search
+from torchcloth.diagnosis.decide import backward_elimination, candidates, gates, search
 from torchcloth.diagnosis.decide.candidates import (
     AcceptedCause,
     _predicts_as_well,
     _predicts_clearly_better,
-    drop_implied,
 )
+from torchcloth.diagnosis.decide.gates import drop_implied
 from torchcloth.diagnosis.decide.search import SearchResult
 from torchcloth.diagnosis.decide.verdict import _decide, _describe_minor
 from torchcloth.diagnosis.inference.comparison import Gain
@@ -136,7 +136,7 @@ def test_what_predicts_better_and_motions_disagree_about_is_a_rival(monkeypatch,
     brings = "air.drag_n" if name == "air.wind[y]" else ""
     better, best = candidate(name, 1.2, amplitude, implies=brings), candidate("air.linear", 2.0, 1.7)
     better.gain = best.prediction = None
-    monkeypatch.setattr(candidates, "is_worthwhile", lambda *_: True)
+    monkeypatch.setattr(gates, "is_worthwhile", lambda *_: True)
     monkeypatch.setattr(candidates, "compare", lambda *_: SimpleNamespace(log_density=over, log_density_ci95=ci95))
     assert _predicts_clearly_better(better, None, best) == open_  # type: ignore[arg-type]
 
@@ -230,11 +230,11 @@ def test_what_a_parameter_does_already_must_show_beside_its_data_sheet(twin, row
     c = SimpleNamespace(
         hypothesis=toys.make_hypothesis("m", equivalent_parameter=twin), fit=fitted, score=row, prior_shift=0.0
     )
-    assert candidates.is_improvement(c, gain) == worth  # type: ignore[arg-type]
-    assert not candidates.is_worthwhile(gain)
-    assert not candidates.is_improvement(c, gain._replace(log_density=3.0, lower_bound_95=-2.0))  # type: ignore[arg-type]
+    assert gates.is_improvement(c, gain) == worth  # type: ignore[arg-type]
+    assert not gates.is_worthwhile(gain)
+    assert not gates.is_improvement(c, gain._replace(log_density=3.0, lower_bound_95=-2.0))  # type: ignore[arg-type]
     c.prior_shift = 6.6  # of stiffening, 016 of e9945f3: by slopes beside its prior it need not gain so much
-    assert candidates.is_improvement(c, gain) == (worth or (twin == "p" and row.is_visible))  # type: ignore[arg-type]
+    assert gates.is_improvement(c, gain) == (worth or (twin == "p" and row.is_visible))  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize(
@@ -243,7 +243,7 @@ def test_what_a_parameter_does_already_must_show_beside_its_data_sheet(twin, row
 def test_what_is_sure_is_not_asked_to_mend_much(low, after, worth):
     """Orthotropy of half its size (050 of b3f2eda) gained 44: most of its millimetres had gone into stiffening."""
     gain = Gain(1e-3, after, 20.0, (low, 30.0), 0.0, (0.0, 0.0), (1e-3, 0.995e-3), (2e-4, 3e-3), low)
-    assert candidates.is_worthwhile(gain) == worth
+    assert gates.is_worthwhile(gain) == worth
 
 
 @pytest.mark.parametrize(
@@ -252,10 +252,10 @@ def test_what_is_sure_is_not_asked_to_mend_much(low, after, worth):
 def test_what_leaves_all_positions_together_further_off_mends_none(after, pull, worth):
     """Though it does where nothing else goes on, or in one episode; a pull may be mended without them."""
     gain = Gain(1e-3, after, 18.0, (4.0, 33.0), 0.0, (0.0, 0.0), (0.72e-3, 0.70e-3), (4e-4, pull), 5.0)
-    assert candidates.is_worthwhile(gain) == worth
+    assert gates.is_worthwhile(gain) == worth
 
 
 def test_what_was_only_felt_has_no_positions():
     nowhere = float("nan")
     gain = Gain(nowhere, nowhere, 18.0, (4.0, 33.0), 0.0, (0.0, 0.0), (0.0, 0.0), (0.0, 1e-2), 5.0)
-    assert candidates.is_worthwhile(gain)
+    assert gates.is_worthwhile(gain)

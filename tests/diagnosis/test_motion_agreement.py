@@ -10,15 +10,9 @@ from helpers import linear_evidence as toys
 from scipy.stats import t
 
 from torchcloth._utils.constants import Z_95
-from torchcloth.diagnosis.decide.candidates import (
-    Candidate,
-    _find_worsened_motions,
-    _measure_prior_shift,
-    _rank,
-    accept,
-    choose_t_threshold,
-)
+from torchcloth.diagnosis.decide.candidates import _find_worsened_motions, _measure_prior_shift, _rank
 from torchcloth.diagnosis.decide.criteria import CRITERIA
+from torchcloth.diagnosis.decide.gates import Candidate, accept, choose_t_threshold
 from torchcloth.diagnosis.decide.verdict import _amplitude_errors, _describe_parameters, _do_motions_disagree
 from torchcloth.diagnosis.inference.comparison import (
     Gain,

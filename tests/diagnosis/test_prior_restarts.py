@@ -8,9 +8,10 @@ import torch
 from helpers import linear_evidence as toys
 
 from torchcloth.diagnosis.data.dataset import DiagnosisData
-from torchcloth.diagnosis.decide import candidates, search
-from torchcloth.diagnosis.decide.candidates import AcceptedCause, Candidate
+from torchcloth.diagnosis.decide import candidates, gates, search
+from torchcloth.diagnosis.decide.candidates import AcceptedCause
 from torchcloth.diagnosis.decide.criteria import CRITERIA, RestartCriteria
+from torchcloth.diagnosis.decide.gates import Candidate
 from torchcloth.diagnosis.inference import prior_restarts
 from torchcloth.diagnosis.inference.prior_restarts import refit_from_prior
 from torchcloth.episodes.world import STRAINED_PRIOR_STDS
@@ -214,14 +215,14 @@ def test_little_is_not_tried_from_the_data_sheet(monkeypatch, least, tried):
 )
 def test_what_one_motion_alone_tells_must_surely_gain(monkeypatch, motions, alone, surely, useful):
     """No other motion has predicted it; of two, the other one tells little of what is usual."""
-    monkeypatch.setattr(candidates, "is_improvement", lambda *_: True)
+    monkeypatch.setattr(gates, "is_improvement", lambda *_: True)
     fit = found(0.1)
-    monkeypatch.setattr(candidates, "jackknife", lambda *_: (fit.model.point, torch.zeros(2)))
+    monkeypatch.setattr(gates, "jackknife", lambda *_: (fit.model.point, torch.zeros(2)))
     gain, score = SimpleNamespace(lower_bound_95=surely), SimpleNamespace(hypothesis=CAUSE, mesh_bias=0.0)
     predicted = SimpleNamespace(episode=torch.arange(len(motions)))
     tried = Candidate(score, fit, predicted, gain, alone, 2.0)  # type: ignore[arg-type]
-    assert candidates.accept(tried, motions) == useful
-    assert candidates.accept(tried, [*motions, "one whose bins all respond discontinuously"]) == useful
+    assert gates.accept(tried, motions) == useful
+    assert gates.accept(tried, [*motions, "one whose bins all respond discontinuously"]) == useful
 
 
 @pytest.mark.parametrize(("amplitude", "tries"), [(1.0, ["first"]), (11.0, ["first", "more"])])

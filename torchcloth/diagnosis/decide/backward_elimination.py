@@ -14,8 +14,9 @@ from ..inference.lack_of_fit import compare_misfit, has_lack_of_fit, measure_lac
 from ..inference.linearise import restrict_to_common_bins
 from ..inference.noise import compute_noise_floor
 from ..inference.permutation_test import run_permutation_test
-from .candidates import AcceptedCause, accept, is_worthwhile, sole_informative_motions
+from .candidates import AcceptedCause, sole_informative_motions
 from .criteria import CRITERIA
+from .gates import accept, is_worthwhile
 
 
 def drop_redundant(

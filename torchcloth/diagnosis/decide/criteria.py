@@ -14,18 +14,18 @@ function that applies the gate and the class below that holds its numbers.
 4.  It is fitted up to 3 steps further if they promise much, unless they predict worse:
     ``candidates.evaluate_candidates`` (``CandidateCriteria``).
 5.  If a single motion has over 70 % of the information about it, its gain on held-out data is certain (lower 95 %
-    bound above 8, with two motions above 25): ``candidates.accept`` (``CandidateCriteria``, ``HeldOutCriteria``).
+    bound above 8, with two motions above 25): ``gates.accept`` (``CandidateCriteria``, ``HeldOutCriteria``).
 6.  Its gain is surely positive, it removes a noticeable part of the misfit of held-out motions (2 % of the mean
-    square, 0.3 mm, 5 mN, or a lower bound above 8), and positions get no worse: ``candidates.is_worthwhile``
+    square, 0.3 mm, 5 mN, or a lower bound above 8), and positions get no worse: ``gates.is_worthwhile``
     (``CandidateCriteria``).
 7.  Instead of gate 6, for a hypothesis that equals a fitted parameter: its gain is surely positive, or the data surely
-    contradict the data sheet: ``candidates.is_improvement``, ``candidates.contradicts_data_sheet``
+    contradict the data sheet: ``gates.is_improvement``, ``gates.contradicts_data_sheet``
     (``CandidateCriteria``).
 8.  Motions agree that its amplitude is not zero (97.5 % quantile of Student's t; 1.96 for a first cause that removes a
-    third), by more than 1.96 times the mesh error: ``candidates.accept`` (``CandidateCriteria``).
-9.  No other motion contradicts it, and its amplitude is below 5 times the typical one: ``candidates.accept``
+    third), by more than 1.96 times the mesh error: ``gates.accept`` (``CandidateCriteria``).
+9.  No other motion contradicts it, and its amplitude is below 5 times the typical one: ``gates.accept``
     (``CandidateCriteria``).
-10. The hypothesis that it implies does not gain 80 % as much alone: ``candidates.drop_implied``
+10. The hypothesis that it implies does not gain 80 % as much alone: ``gates.drop_implied``
     (``CandidateCriteria``).
 11. It gains more than 95 % of 40 permutations: ``permutation_test.run_permutation_test`` (``PermutationCriteria``).
 12. A further cause explains at least half of the remaining misfit: ``search.search`` (``SearchCriteria``).

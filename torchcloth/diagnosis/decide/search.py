@@ -34,16 +34,9 @@ from .backward_elimination import (
     replace_by_implied,
     supported_only_by_misfit_motions,
 )
-from .candidates import (
-    AcceptedCause,
-    Candidate,
-    contradicts_data_sheet,
-    evaluate_candidates,
-    propose_candidates,
-    sole_informative_motions,
-    worsens_positions,
-)
+from .candidates import AcceptedCause, evaluate_candidates, propose_candidates, sole_informative_motions
 from .criteria import CRITERIA
+from .gates import Candidate, contradicts_data_sheet, worsens_positions
 
 
 class SearchPath(NamedTuple):

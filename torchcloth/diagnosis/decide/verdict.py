@@ -33,8 +33,9 @@ from ..report.wording import collect_warnings, write_sentences
 from ..unknown.localisation import localise_cause
 from ..unknown.missing_force import MissingForce
 from ..unknown.residual_force import ResidualForceFit
-from .candidates import AcceptedCause, look_up_t_quantile
+from .candidates import AcceptedCause
 from .criteria import CRITERIA
+from .gates import look_up_t_quantile
 from .in_sample import rank_in_sample
 from .search import SearchResult
 

@@ -20,7 +20,7 @@ import torch
 from torchcloth import diagnosis, recordings
 from torchcloth._utils import resume
 from torchcloth.diagnosis.decide import candidates
-from torchcloth.diagnosis.decide.candidates import Candidate
+from torchcloth.diagnosis.decide.gates import Candidate
 from torchcloth.diagnosis.inference.comparison import jackknife
 
 from . import make_case
