@@ -364,7 +364,7 @@ def _correct_for_mesh(
     if not recordings or used is not full:
         return final, covariance, {}, []
     try:
-        step = mesh_correction(full, final, recordings)
+        step = mesh_correction(full, final, recordings, refine_cloth(full.cloth))
         moved = final._replace(raw=full.clip(final.raw + EXTRAPOLATION_FACTOR * step))
         full.observe(moved.raw)  # fails here if it cannot be simulated; the frames are remembered for later
     except (SimulationDiverged, UnstableStep) as error:
