@@ -195,7 +195,7 @@ def test_a_correction_that_cannot_be_simulated_is_none(model, brief, monkeypatch
             raise SimulationDiverged("the cloth is torn apart")
         return seen(self, raw)
 
-    def step(objective, final, recordings):
+    def step(objective, final, *_):
         ended.append(float(final.raw[0]))
         moved = torch.zeros_like(final.raw)
         moved[0] = 0.1 * longest
