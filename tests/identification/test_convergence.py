@@ -66,6 +66,14 @@ def test_a_search_cut_short_near_the_optimum_says_nothing_either(model, brief, n
     assert finished.parameters["youngs_modulus"].identifiable
 
 
+def test_a_search_cut_short_within_a_standard_error_says_why_its_numbers_stand(model, brief):
+    fit = identify(model, brief, ["youngs_modulus"], iterations=2)
+    assert not fit.fit["converged"]
+    assert fit.parameters["youngs_modulus"].identifiable
+    (warning,) = (w for w in fit.warnings if w.startswith("stopped after"))
+    assert "at most one standard error farther, and the standard errors include that step" in warning
+
+
 @pytest.mark.slow
 def test_a_sheet_between_free_clamps_is_found_from_far_off():
     """Drag and bending, which this pull hardly tells, ask for steps longer than allowed: E must not wait for them."""

@@ -153,7 +153,8 @@ def fit_fields(
         f"{', '.join(fitted)}: {NO_ERROR_NOTE}; where the data say little, the values are those of neighbours and of "
         "the start"
     ]
-    warnings += [] if converged else [f"stopped after {iterations} iterations before converging"]
+    unfinished = f"stopped after {iterations} iterations before converging: more of them may change the values"
+    warnings += [] if converged else [unfinished]
     return FieldFit(objective.field_values(raw), contrast, fit, warnings, search.history, before, after)
 
 

