@@ -1,0 +1,224 @@
+"""The first shape of a recording, from its first clouds, by a trained network and the simulation of what follows."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import NamedTuple
+
+import torch
+from safetensors import safe_open
+from safetensors.torch import save_file
+from torch import Tensor
+
+from .._utils.torch_modes import isolated_grad_mode
+from ..boundaries import Grasp
+from ..boundaries.motion import interpolate_poses
+from ..cloth import Cloth
+from ..episodes.observed import Episode, build_episode
+from ..errors import InvalidInput, RecordingError, SimulationDiverged
+from ..losses import chamfer_to_surface
+from ..meshes import Mesh
+from ..recordings import Recording
+from .network import PoseEstimator, PoseNetworkConfig, PosePrediction
+from .scene_frame import PoseInputs, rest_coordinates
+
+SHIPPED_NETWORK = Path(__file__).with_name("pose_network.safetensors")
+NETWORK_FORMAT = "torchcloth-pose-network-1"
+POINTS_SEEN = 256  # of a cloud, as in training
+CLOUD_PERIOD_S = 1 / 30  # between a cloud and the one before, as in training
+VELOCITY_STEP_S = 0.01  # of the difference that gives a gripper's velocity
+SIMULATED_FRAMES = 6  # with which hypotheses are compared
+MAX_NETWORK_BYTES = 50_000_000
+
+
+class FirstShape(NamedTuple):
+    """The shape of a cloth at the first frame.
+
+    Attributes:
+        x: [V, 3] m, of the hypothesis that predicts the next clouds best.
+        std: [V] m, standard deviation of a coordinate.
+        v: [V, 3] m/s.
+        distances: [S] m, mean distance of the next clouds from the simulation of each hypothesis; NaN: it diverged.
+        weights: [S], what the network gave each hypothesis.
+    """
+
+    x: Tensor
+    std: Tensor
+    v: Tensor
+    distances: Tensor
+    weights: Tensor
+
+
+# -- weights ----------------------------------------------------------------------------------------------------------
+
+
+def save_network(network: PoseEstimator, path: Path) -> None:
+    """Write the weights of a network, in half precision, and its size."""
+    tensors = {name: value.detach().half().contiguous() for name, value in network.state_dict().items()}
+    metadata = {"format": NETWORK_FORMAT, "config": json.dumps(network.description)}
+    save_file(tensors, path, metadata)
+
+
+def load_network(path: Path | None = None) -> PoseEstimator:
+    """Read a network that `save_network` wrote; None: the one that is shipped. It runs no code of the file.
+
+    Raises:
+        InvalidInput: a file that is no such network.
+    """
+    path = SHIPPED_NETWORK if path is None else Path(path)
+    if not path.is_file() or path.stat().st_size > MAX_NETWORK_BYTES:
+        got = "a file that is too large" if path.is_file() else "no such file"
+        raise InvalidInput(f"{path}: network", got=got, expected="weights of python -m torchcloth.training.pose")
+    try:
+        with safe_open(path, "pt") as file:
+            metadata = file.metadata() or {}
+            tensors = {name: file.get_tensor(name).float() for name in file.keys()}  # noqa: SIM118 - no mapping
+        if metadata.get("format") != NETWORK_FORMAT:
+            raise ValueError(f"format {metadata.get('format')!r}")
+        with torch.device("meta"):
+            network = PoseEstimator(_read_config(metadata["config"]))
+        network.load_state_dict(tensors, assign=True)
+    except Exception as error:
+        reason = str(error).strip().splitlines()[0][:200]
+        raise InvalidInput(
+            f"{path}: network", got=reason, expected=f"weights in the format {NETWORK_FORMAT} (safetensors)"
+        ) from None
+    if not all(bool(value.isfinite().all()) for value in tensors.values()):
+        raise InvalidInput(f"{path}: network", got="weights that are not finite", expected="finite numbers")
+    return network.eval()
+
+
+def _read_config(text: str) -> PoseNetworkConfig:
+    numbers = json.loads(text)
+    if not all(isinstance(value, int) and 1 <= value <= 1024 for value in numbers.values()):
+        raise ValueError("config: sizes must be whole numbers from 1 to 1024")
+    return PoseNetworkConfig(**numbers)
+
+
+# -- a recording's clouds as the network's inputs ---------------------------------------------------------------------
+
+
+def pose_inputs(
+    cloth: Cloth, episode: Episode, frame: int, rest: Tensor, previous: Tensor | None = None, seed: int = 0
+) -> PoseInputs:
+    """Return what the network sees of one frame, as a batch of one.
+
+    Args:
+        cloth: of the episode.
+        episode: clouds and grippers' motion.
+        frame: its index.
+        rest: [V, 3] m, rest coordinates of the vertices.
+        previous: [V, 3] m, the estimate of the frame before.
+        seed: of the points that are drawn.
+
+    Raises:
+        RecordingError: the frame has no points.
+    """
+    cloud = episode.clouds[frame]
+    if not len(cloud):
+        raise RecordingError(f"{episode.name}: frame {frame}", got="no points", expected="a cloud for the network")
+    generator = torch.Generator().manual_seed(seed)
+    drawn = torch.cat([torch.randperm(len(cloud), generator=generator) for _ in range(-(-POINTS_SEEN // len(cloud)))])
+    grip = torch.zeros(len(rest), dtype=torch.int64)
+    position, velocity = torch.full((2, 3), torch.nan), torch.zeros(2, 3)
+    for k, name in enumerate(_grippers_seen(cloth, rest)):
+        boundary, trajectory = cloth.boundaries[name], episode.motion[name]
+        assert isinstance(boundary, Grasp)
+        first, last = float(trajectory.t[0]), float(trajectory.t[-1])
+        now = float(episode.times[frame])
+        times = torch.tensor([max(first, now - VELOCITY_STEP_S), now, min(last, now + VELOCITY_STEP_S)])
+        places = interpolate_poses(trajectory, times.to(trajectory.t))[:, :3, 3].float()
+        grip[boundary.index] = k + 1
+        position[k], velocity[k] = places[1], (places[2] - places[0]) / float(times[2] - times[0])
+    before = torch.full((len(rest), 3), torch.nan) if previous is None else previous.float()
+    parts = (cloud[drawn[:POINTS_SEEN]].float(), rest.float(), torch.ones(len(rest), dtype=torch.bool), grip)
+    return PoseInputs(*(part.unsqueeze(0) for part in (*parts, position, velocity, before)))
+
+
+def _grippers_seen(cloth: Cloth, rest: Tensor) -> list[str]:
+    """Names of at most two grasps, those that are farthest apart on the fabric."""
+    names = [name for name, part in cloth.boundaries.items() if isinstance(part, Grasp)]
+    if len(names) <= 2:
+        return names
+    centres = torch.stack([rest[cloth.boundaries[name].index].mean(0) for name in names])  # type: ignore[index]
+    apart = torch.cdist(centres, centres)
+    return [names[k] for k in divmod(int(apart.argmax()), len(names))]
+
+
+def recorded_rest_coordinates(cloth: Cloth, recording: Recording) -> Tensor:
+    """Return rest coordinates [V, 3] m of the recording's own vertices, to which ``initial_vertices`` belong."""
+    info = recording.cloth
+    if info.vertices is None or info.faces is None:
+        return rest_coordinates(cloth.mesh)
+    return rest_coordinates(Mesh.build(info.vertices, info.faces, info.uv))
+
+
+# -- the first shape --------------------------------------------------------------------------------------------------
+
+
+@isolated_grad_mode()
+def estimate_first_shape(
+    cloth: Cloth, recording: Recording, network: PoseEstimator | None = None, samples: int = 4
+) -> FirstShape:
+    """Estimate the shape at the first frame from its cloud, and choose among hypotheses by what follows.
+
+    Each hypothesis is simulated along the grippers' motion with the cloth's values. The one from which the next clouds
+    are least far is returned.
+
+    Args:
+        cloth: the model, with fitted or nominal values.
+        recording: one episode of it, whose own first shape is not looked at.
+        network: None: the one that is shipped.
+        samples: number of hypotheses.
+
+    Raises:
+        RecordingError: no cloud at the first frame.
+    """
+    network = network or load_network()
+    bare = replace(recording, cloth=replace(recording.cloth, initial_vertices=None))
+    episode, rest = build_episode(cloth, bare), recorded_rest_coordinates(cloth, recording)
+    with torch.no_grad():
+        first = network(pose_inputs(cloth, episode, 0, rest), samples)
+        velocities = _velocities(network, cloth, episode, rest, first)
+        distances = torch.stack(
+            [_distance_ahead(cloth, episode, x, v) for x, v in zip(first.hypotheses[0], velocities, strict=True)]
+        )
+    best = int(distances.nan_to_num(torch.inf).argmin())
+    return FirstShape(
+        first.hypotheses[0, best], first.hypothesis_std[0, best], velocities[best], distances, first.weights[0]
+    )
+
+
+def _velocities(
+    network: PoseEstimator, cloth: Cloth, episode: Episode, rest: Tensor, first: PosePrediction
+) -> Sequence[Tensor]:
+    """Velocity [V, 3] m/s of each hypothesis, from the next cloud where there is one in time."""
+    has_next = len(episode.clouds) > 1 and len(episode.clouds[1]) > 0
+    if not has_next or float(episode.times[1] - episode.times[0]) > 2 * CLOUD_PERIOD_S:
+        return [first.v[0]] * first.hypotheses.shape[1]
+    return [network(pose_inputs(cloth, episode, 1, rest, x)).v[0] for x in first.hypotheses[0]]
+
+
+def _distance_ahead(cloth: Cloth, episode: Episode, x: Tensor, v: Tensor) -> Tensor:
+    """Mean distance [m] of the next clouds from the simulation that begins here; NaN where it diverges."""
+    times = episode.times[: 1 + SIMULATED_FRAMES]
+    state = cloth.state(x.to(episode.initial), v.to(episode.initial))
+    try:
+        frames = cloth(state, episode.motion, times.tolist()).x if len(times) > 1 else state.x[None]
+    except SimulationDiverged:
+        return x.new_tensor(torch.nan)
+    faces = torch.as_tensor(cloth.mesh.faces)
+    distances = [
+        chamfer_to_surface(cloud, frame, faces).to(x)
+        for cloud, frame in zip(episode.clouds, frames, strict=False)
+        if len(cloud)
+    ]
+    return torch.stack(distances).mean()
+
+
+def with_first_shape(recording: Recording, x: Tensor) -> Recording:
+    """Return the recording with a first shape [V, 3] m, of its own vertices."""
+    return replace(recording, cloth=replace(recording.cloth, initial_vertices=x.double().numpy()))
