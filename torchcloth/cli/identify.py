@@ -176,7 +176,7 @@ def _identify(options: argparse.Namespace) -> int:
     fit = _fit(options, cloth, episodes)
     if isinstance(fit, Identification):
         fit = replace(fit, warnings=[*fit.warnings, *notes])
-        return _report(options, fit, cloth, episodes)
+        return _report(options, fit, cloth)
     return identify_fields.report(options.out, fit, cloth)
 
 
@@ -326,19 +326,18 @@ def _should_refine(options: argparse.Namespace) -> bool:
     return options.method in ("gauss-newton", "lbfgs") and options.stop == "converged" and not options.profile
 
 
-def _report(options: argparse.Namespace, fit: Identification, cloth: Cloth, recordings: list[Recording]) -> int:
+def _report(options: argparse.Namespace, fit: Identification, cloth: Cloth) -> int:
     from .._utils.resume import clear_store
     from ..identification import build_episode
     from ..identification.pictures import save_fit_pictures
     from ..identification.result import IDENTIFICATION_FILE_NAME
     from ..identification.tables import print_fit
-    from ..inspection.corrections import check_all
 
     folder = options.out
     note = replacement_note(folder / IDENTIFICATION_FILE_NAME)
     path = fit.save(folder, options.model)
-    used = check_all(recordings)[0] if options.checks else recordings  # the clouds that were fitted
-    pictures = save_fit_pictures(fit, [build_episode(cloth, r) for r in used], cloth.mesh.faces, folder)
+    episodes = [build_episode(cloth, recording) for recording in fit.recordings]
+    pictures = save_fit_pictures(fit, episodes, cloth.mesh.faces, folder)
     clear_store(folder / PROGRESS_FOLDER_NAME)
     print_fit(fit)
     print(f"result:   {path}{note}")

@@ -67,6 +67,7 @@ def simulate_with_tangents(
     episode: Episode,
     dt: float | None = None,
     modes: Tensor | None = None,
+    by_unknowns: bool = True,
 ) -> tuple[Frames, Frames]:
     """Simulate the episode with exact derivatives, in one forward pass.
 
@@ -79,17 +80,18 @@ def simulate_with_tangents(
         episode: what drives the cloth.
         dt: largest substep [s]; None: the stable one.
         modes: [M, V, 3] m, changes of the initial shape along which there are derivatives, too.
+        by_unknowns: whether there are derivatives by the unknowns; without them there must be modes.
 
     Returns:
         The frames, and their derivatives by the unknowns, then along the modes, [K + M, ...].
     """
-    extra = 0 if modes is None else len(modes)
+    count, extra = len(unknowns) if by_unknowns else 0, 0 if modes is None else len(modes)
     value = raw.detach().to(episode.initial)
-    directions = torch.eye(len(unknowns) + extra, len(unknowns), dtype=episode.initial.dtype)
+    directions = torch.eye(count + extra, len(unknowns), dtype=episode.initial.dtype)
     entries = {f"cloth.{key}": v for key, v in make_state_entries(unknowns, value).items()}
-    along = Directions(make_state_entries(unknowns, directions))
+    along = Directions(make_state_entries(unknowns, directions) if by_unknowns else {})
     if modes is not None and extra:
-        along = along._replace(state=initial_state_tangents(cloth, episode, modes, len(unknowns)))
+        along = along._replace(state=initial_state_tangents(cloth, episode, modes, count))
     out, tangents = call_with_parameters(_ReplayWithTangents(cloth), entries, (episode, along, dt))
     return frames_from_rollout(out), frames_from_rollout(tangents)
 

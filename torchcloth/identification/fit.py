@@ -41,11 +41,18 @@ from .uncertainty.misfit import estimate_point_noise, find_misfit
 from .uncertainty.model_error import MODEL_ERRORS, ModelErrors, add_model_error
 from .uncertainty.profile_likelihood import compute_profiles
 from .uncertainty.replicates import assign_strata
-from .uncertainty.richardson import CORRECTION_UNCERTAINTY, EXTRAPOLATION_FACTOR, mesh_correction, refine_cloth
+from .uncertainty.richardson import (
+    CORRECTION_UNCERTAINTY,
+    EXTRAPOLATION_FACTOR,
+    FineScene,
+    mesh_correction,
+    refine_cloth,
+)
 
 DEFAULT_MAX_ITERATIONS = 35  # of the DiffCP paper
 MAX_STARTS = 1000
 NO_PROFILE_REASON = "the motion can be predicted for a while only, or by simulations spread around the solution"
+NO_PROFILE_OF_MISFIT_REASON = "the model does not describe these data"
 
 
 @isolated_grad_mode()
@@ -142,8 +149,7 @@ def identify(
             nuisances = {"clock": clock_std, **nuisances}
     if refine and profile:
         raise InvalidInput("profile", got="refine as well", expected="one of them: a profile is that of the given mesh")
-    if refine:
-        refine_cloth(cloth)  # refuses now what it would refuse at the end
+    fine_scene = FineScene(refine_cloth(cloth), recordings) if refine else None
 
     parameters = [parameters] if isinstance(parameters, str) else parameters
     names = default_parameters(cloth) if parameters is None else list(parameters)
@@ -167,10 +173,10 @@ def identify(
     search = Search(objective, stop, on_progress, assign_strata(recordings))
     before = objective.observe(objective.start)
     outcome = search.run(method, start, iterations, rate, not warm_start and stop != "paper", starts)
-    refine_recordings = recordings if refine else []
     noise_std = estimate_point_noise(recordings)
-    fit = _assemble_result(search, before, outcome, began, profile, refine_recordings, model_errors, noise_std)
-    return replace(fit, model=describe_model(cloth, fit, originals, recordings, dt), warnings=[*notes, *fit.warnings])
+    fit = _assemble_result(search, before, outcome, began, profile, fine_scene, model_errors, noise_std)
+    model = describe_model(cloth, fit, originals, recordings, dt)
+    return replace(fit, model=model, recordings=list(recordings), warnings=[*notes, *fit.warnings])
 
 
 def _check_options(method: str, stop: str, iterations: int, starts: int) -> None:
@@ -254,7 +260,7 @@ def _assemble_result(
     outcome: Outcome,
     began: float,
     profile: Sequence[str],
-    refine_recordings: Sequence[Recording],
+    fine_scene: FineScene | None,
     model_errors: ModelErrors,
     noise_std: float,
 ) -> Identification:
@@ -262,22 +268,31 @@ def _assemble_result(
     full, used, checked = search.objective, outcome.objective_used, outcome.checked
     final, warnings = checked.final, list(checked.warnings)
 
+    # a solution that means nothing gets no simulation for its errors
+    before, null = [s.x for s in start], [carry_rigidly(e) for e in full.episodes]
+    chamfer_before = distance_metrics(before, full.episodes, full.faces).chamfer
+    misfit_reason = _find_misfit(full, used, final, chamfer_before, noise_std)
+    if misfit_reason:
+        checked = checked._replace(failure_reason=misfit_reason)
+
     # covariance, and the correction for the mesh
     covariance = solution_covariance(used, checked, search.strata)
     is_regular = not checked.is_withdrawn and checked.covariance is None
     final, covariance, mesh_entries, uncorrected = _correct_for_mesh(
-        full, used, final, covariance, refine_recordings if is_regular else []
+        full, used, final, covariance, fine_scene if is_regular else None
     )
     warnings += uncorrected
     end = full.observe(final.raw)
-    before, after, null = [s.x for s in start], [s.x for s in end], [carry_rigidly(e) for e in full.episodes]
+    after = [s.x for s in end]
 
     # estimates, with profiles where the whole motion is regular
     total_covariance = add_model_error(full.unknowns, final.raw, covariance, model_errors)
     estimates = make_estimates(full.cloth, full.unknowns, final.raw, total_covariance)
     has_profiles = not (checked.warnings or checked.is_withdrawn)
     profiles = compute_profiles(used, final, covariance, profile, search.report_progress) if has_profiles else {}
-    warnings += [] if has_profiles or not profile else [f"no profile of {', '.join(profile)}: {NO_PROFILE_REASON}"]
+    if profile and not has_profiles:
+        why = NO_PROFILE_OF_MISFIT_REASON if misfit_reason else NO_PROFILE_REASON
+        warnings.append(f"no profile of {', '.join(profile)}: {why}")
     estimates = apply_profiles(estimates, profiles)
 
     # distances and counts
@@ -301,7 +316,8 @@ def _assemble_result(
 
     # withdrawal and warnings
     unbeaten_null = find_unbeaten_null(full, end)
-    misfit_reason = _find_misfit(used, final, fit, noise_std)
+    if mesh_entries:  # it moved the solution
+        misfit_reason = _find_misfit(full, used, final, chamfer_before, noise_std)
     is_withdrawn = checked.is_withdrawn or bool(unbeaten_null or misfit_reason)
     if is_withdrawn:  # slopes of chaos, or far from the optimum, promise tiny errors
         estimates = withdraw_estimates(estimates, full.unknowns, final.raw)
@@ -333,20 +349,24 @@ def _assemble_result(
     )
 
 
-def _find_misfit(used: Objective, final: levenberg_marquardt.Iterate, fit: Mapping[str, Any], noise_std: float) -> str:
+def _find_misfit(
+    full: Objective, used: Objective, final: levenberg_marquardt.Iterate, chamfer_before: float, noise_std: float
+) -> str:
     """Return why the fit is too far from the points to say anything, and what may be the reason; empty where it is not.
 
     Args:
+        full: objective of all frames.
         used: objective of the frames that were used.
         final: the solution.
-        fit: its distances.
+        chamfer_before: distance of the start values [m].
         noise_std: of the points [m].
     """
-    if "points_misfit" not in fit:
+    misfit = _observation_entries(used, final).get("points_misfit")
+    if misfit is None:
         return ""
-    over_start = fit["chamfer_after"] / fit["chamfer_before"] if fit["chamfer_before"] > 0 else 0.0
-    misfit = find_misfit(fit["points_misfit"], noise_std, over_start, final.converged)
-    return misfit and f"{misfit}; {describe_reasons(rank_reasons(used, final))}"
+    over_start = full.distance_metrics(final.raw).chamfer / chamfer_before if chamfer_before > 0 else 0.0
+    reason = find_misfit(misfit, noise_std, over_start, final.converged)
+    return reason and f"{reason}; {describe_reasons(rank_reasons(used, final))}"
 
 
 def _correct_for_mesh(
@@ -354,17 +374,17 @@ def _correct_for_mesh(
     used: Objective,
     final: levenberg_marquardt.Iterate,
     covariance: Tensor,
-    recordings: Sequence[Recording],
+    scene: FineScene | None,
 ) -> tuple[levenberg_marquardt.Iterate, Tensor, dict[str, float], list[str]]:
     """Extrapolate the solution to ever smaller triangles.
 
     Returns:
         The solution, its wider covariance, the size of the correction for ``fit``, and why it is not known.
     """
-    if not recordings or used is not full:
+    if scene is None or used is not full:
         return final, covariance, {}, []
     try:
-        step = mesh_correction(full, final, recordings, refine_cloth(full.cloth))
+        step = mesh_correction(full, final, scene)
         moved = final._replace(raw=full.clip(final.raw + EXTRAPOLATION_FACTOR * step))
         full.observe(moved.raw)  # fails here if it cannot be simulated; the frames are remembered for later
     except (SimulationDiverged, UnstableStep) as error:

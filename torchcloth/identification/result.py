@@ -14,6 +14,7 @@ from torch import Tensor
 
 from .._utils.files import write_atomically, write_text
 from ..cloth import Cloth
+from ..recordings import Recording
 from .uncertainty.estimates import Combination, Estimate, InfluenceStatement, Profile
 
 IDENTIFICATION_SCHEMA = "torchcloth.identification/1"
@@ -61,6 +62,7 @@ class Identification:
         profiles: of the parameters for which one was asked.
         forces_before: gripper -> [T, 6] N, N m of each episode at the start values, as ``Episode.wrenches``.
         forces_after: the wrenches at the fitted values.
+        recordings: the episodes as they were fitted, after the checks.
     """
 
     parameters: dict[str, Estimate]
@@ -79,6 +81,7 @@ class Identification:
     profiles: dict[str, Profile] = field(default_factory=dict)
     forces_before: list[dict[str, Tensor]] = field(default_factory=list, repr=False)
     forces_after: list[dict[str, Tensor]] = field(default_factory=list, repr=False)
+    recordings: list[Recording] = field(default_factory=list, repr=False)
 
     def as_dict(self) -> dict[str, Any]:
         """Return the content of identification.json."""

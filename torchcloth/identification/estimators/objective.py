@@ -84,6 +84,7 @@ class Objective:
         self.simulations = 0
         self._counted_points: set[tuple[float, ...]] = set()
         self._recent_frames: dict[tuple[float, ...], list[Frames]] = {}
+        self._last_linearised: tuple[tuple[float, ...], list[tuple[Frames, Frames]]] | None = None
 
     def first_fraction(self, fraction: float) -> Objective:
         """Return the objective of the first ``fraction`` of the frames."""
@@ -240,14 +241,14 @@ class Objective:
             episode = replace(episode, initial=episode.initial + shift)
         return episode
 
-    def _tangents(self, raw: Tensor, i: int) -> tuple[Frames, Frames]:
-        """One episode, and its derivatives by all unknowns."""
+    def _tangents(self, raw: Tensor, i: int, by_fabric: bool = True) -> tuple[Frames, Frames]:
+        """One episode, and its derivatives by all unknowns; those by the fabric's are zero if not ``by_fabric``."""
         placed_modes, episode = self._initial_shape_modes(i), self._initial_episode(raw, i)
         modes = torch.cat([m for _, m in placed_modes]) if placed_modes else None
         fabric = raw[: len(self.unknowns)]
-        frames, computed = simulate_with_tangents(self.cloth, self.unknowns, fabric, episode, self.dt, modes)
+        frames, computed = simulate_with_tangents(self.cloth, self.unknowns, fabric, episode, self.dt, modes, by_fabric)
         mode_columns = [k for index, _ in placed_modes for k in range(index.start, index.stop)]
-        columns = torch.tensor([*range(len(self.unknowns)), *mode_columns])
+        columns = torch.tensor([*range(len(self.unknowns) if by_fabric else 0), *mode_columns])
 
         def spread(d: Tensor) -> Tensor:
             return d.new_zeros(len(raw), *d.shape[1:]).index_copy(0, columns, d)
@@ -273,13 +274,34 @@ class Objective:
     def linearise(self, raw: Tensor) -> levenberg_marquardt.Linearised:
         """Compute residual rows with exact sensitivities, by forward mode through the whole simulation.
 
-        Its frames are not remembered. Their last digits differ from those of a simulation without tangents, so a
-        resumed fit, which recalls either, would differ in the last digit.
+        Its frames are no answer of ``observe``. Their last digits differ from those of a simulation without tangents,
+        so a resumed fit, which recalls either, would differ in the last digit.
         """
-        episodes = range(len(self.episodes))
         self._count_simulations(raw)
         self.simulations += len(self.unknowns) * len(self.episodes)
-        rows = self._recall("linearise", raw, lambda: self._rows([self._tangents(raw, i) for i in episodes]))
+        rows = self._recall("linearise", raw, lambda: self._rows(self._remember_tangents(raw)))
+        return levenberg_marquardt.Linearised(*rows)
+
+    def _remember_tangents(self, raw: Tensor) -> list[tuple[Frames, Frames]]:
+        self._last_linearised = None  # two of them would double the memory
+        simulated = [self._tangents(raw, i) for i in range(len(self.episodes))]
+        self._last_linearised = tuple(raw.tolist()), simulated
+        return simulated
+
+    def _take_tangents(self, raw: Tensor) -> list[tuple[Frames, Frames]]:
+        """Return all episodes with their derivatives, those of the last linearisation if it was here."""
+        last, self._last_linearised = self._last_linearised, None
+        if last is not None and last[0] == tuple(raw.tolist()):
+            return last[1]
+        return [self._tangents(raw, i) for i in range(len(self.episodes))]
+
+    def linearise_first_shape(self, raw: Tensor) -> levenberg_marquardt.Linearised:
+        """Compute residual rows with derivatives by the nuisances alone; those by the fabric's unknowns are zero."""
+        self._count_simulations(raw)
+        episodes = range(len(self.episodes))
+        rows = self._recall(
+            "linearise-first-shape", raw, lambda: self._rows([self._tangents(raw, i, False) for i in episodes])
+        )
         return levenberg_marquardt.Linearised(*rows)
 
     def distance_metrics(self, raw: Tensor) -> DistanceMetrics:
@@ -358,7 +380,7 @@ class Objective:
         Returns:
             The rows, and how far a unit of each of the fabric's unknowns moves the cloth.
         """
-        simulated = [self._tangents(raw, i) for i in range(len(self.episodes))]
+        simulated = self._take_tangents(raw)
         for k in range(len(self.unknowns)):
             step, shifted_frames = self._simulate_shifted(raw, k, float(steps[k]))
             for (frames, derivatives), shifted in zip(simulated, shifted_frames, strict=bool(step)):

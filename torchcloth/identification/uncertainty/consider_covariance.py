@@ -86,7 +86,7 @@ def add_initial_shape_noise(
     raw[~is_considered] = final.raw
     considered = is_considered.nonzero().squeeze(-1).tolist()
     if by_tangents:
-        slopes = wider.linearise(raw).jacobian[:, considered]
+        slopes = wider.linearise_first_shape(raw).jacobian[:, considered]
     else:
         here = wider.evaluate_all(raw).residual
         slopes = torch.stack([_finite_slope(wider, raw, k, here) for k in considered], 1)

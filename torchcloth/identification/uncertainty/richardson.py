@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -31,6 +32,18 @@ from ..estimators.objective import Objective
 
 EXTRAPOLATION_FACTOR = 4 / 3  # of the step between two meshes with edges of ratio 2, to the limit
 CORRECTION_UNCERTAINTY = 1 / 3  # of that step, added to the standard errors
+
+
+class FineScene(NamedTuple):
+    """What the correction simulates.
+
+    Attributes:
+        cloth: the fit's, on a mesh twice as fine (``refine_cloth``).
+        recordings: of the fit.
+    """
+
+    cloth: Cloth
+    recordings: Sequence[Recording]
 
 
 def refine_cloth(cloth: Cloth) -> Cloth:
@@ -71,21 +84,18 @@ def refine_recording(recording: Recording, coarse: Mesh, fine: Mesh) -> Recordin
     return replace(recording, cloth=info)
 
 
-def mesh_correction(
-    objective: Objective, final: levenberg_marquardt.Iterate, recordings: Sequence[Recording], cloth: Cloth
-) -> Tensor:
+def mesh_correction(objective: Objective, final: levenberg_marquardt.Iterate, scene: FineScene) -> Tensor:
     """Compute the step [K] that a mesh twice as fine asks for at the solution, in unconstrained coordinates.
 
     Args:
         objective: of all frames.
         final: the solution.
-        recordings: of the fit.
-        cloth: the objective's, on the finer mesh (``refine_cloth``).
+        scene: the same on the finer mesh.
     """
-    coarse = objective.cloth
+    coarse, cloth = objective.cloth, scene.cloth
     episodes = [
         build_episode(cloth, refine_recording(r, coarse.mesh, cloth.mesh)).with_lookahead(e.lookahead)
-        for r, e in zip(recordings, objective.episodes, strict=True)
+        for r, e in zip(scene.recordings, objective.episodes, strict=True)
     ]
     fine = Objective(
         cloth, objective.unknowns, episodes, objective.dt, objective.nuisances, objective.blocks, objective.noise_floors
