@@ -14,7 +14,7 @@ torch.set_num_threads(1)
 # `make test-fast` leaves them out.
 LONG_FILES = (
     "test_docs_code.py",
-    "test_cli.py",
+    "test_command.py",
     "test_boundaries.py",
     "test_demo.py",
     "test_honesty.py",
@@ -50,7 +50,6 @@ LONG_FILES = (
     "test_operators.py",
     "test_blocks.py",
     "test_convergence.py",
-    "test_command.py",
     "test_garment_studies.py",
     "test_simulate.py",
     "test_dynamics.py",
