@@ -271,7 +271,7 @@ def _assemble_result(
     # a solution that means nothing gets no simulation for its errors
     before, null = [s.x for s in start], [carry_rigidly(e) for e in full.episodes]
     chamfer_before = distance_metrics(before, full.episodes, full.faces).chamfer
-    misfit_reason = _find_misfit(full, used, final, chamfer_before, noise_std)
+    misfit_reason, likely_reasons = _find_misfit(full, used, final, chamfer_before, noise_std)
     if misfit_reason:
         checked = checked._replace(failure_reason=misfit_reason)
 
@@ -317,8 +317,9 @@ def _assemble_result(
     # withdrawal and warnings
     unbeaten_null = find_unbeaten_null(full, end)
     if mesh_entries:  # it moved the solution
-        misfit_reason = _find_misfit(full, used, final, chamfer_before, noise_std)
+        misfit_reason, likely_reasons = _find_misfit(full, used, final, chamfer_before, noise_std)
     is_withdrawn = checked.is_withdrawn or bool(unbeaten_null or misfit_reason)
+    fit["withdrawn"] = is_withdrawn
     if is_withdrawn:  # slopes of chaos, or far from the optimum, promise tiny errors
         estimates = withdraw_estimates(estimates, full.unknowns, final.raw)
     warnings += [reason for reason in (misfit_reason, outcome.unfinished_reason) if reason]
@@ -344,6 +345,7 @@ def _assemble_result(
         influences=describe_influences(full.unknowns, final.raw, checked.influence, estimates.parameters),
         combinations=[] if is_withdrawn else find_combinations(full.unknowns, final.raw, total_covariance),
         profiles=profiles,
+        likely_reasons=likely_reasons,
         forces_before=[_observed_forces(s.wrench, e) for s, e in zip(start, full.episodes, strict=True)],
         forces_after=[_observed_forces(s.wrench, e) for s, e in zip(end, full.episodes, strict=True)],
     )
@@ -351,8 +353,8 @@ def _assemble_result(
 
 def _find_misfit(
     full: Objective, used: Objective, final: levenberg_marquardt.Iterate, chamfer_before: float, noise_std: float
-) -> str:
-    """Return why the fit is too far from the points to say anything, and what may be the reason; empty where it is not.
+) -> tuple[str, dict[str, float]]:
+    """Find out whether the fit is too far from the points to say anything.
 
     Args:
         full: objective of all frames.
@@ -360,13 +362,19 @@ def _find_misfit(
         final: the solution.
         chamfer_before: distance of the start values [m].
         noise_std: of the points [m].
+
+    Returns:
+        Why it is, and the share of the misfit that each error of the recording would explain; empty where it is not.
     """
     misfit = _observation_entries(used, final).get("points_misfit")
     if misfit is None:
-        return ""
+        return "", {}
     over_start = full.distance_metrics(final.raw).chamfer / chamfer_before if chamfer_before > 0 else 0.0
     reason = find_misfit(misfit, noise_std, over_start, final.converged)
-    return reason and f"{reason}; {describe_reasons(rank_reasons(used, final))}"
+    if not reason:
+        return "", {}
+    reasons = rank_reasons(used, final)
+    return f"{reason}; {describe_reasons(reasons)}", {r.name: r.share for r in reasons}
 
 
 def _correct_for_mesh(

@@ -63,6 +63,8 @@ class Identification:
         forces_before: gripper -> [T, 6] N, N m of each episode at the start values, as ``Episode.wrenches``.
         forces_after: the wrenches at the fitted values.
         recordings: the episodes as they were fitted, after the checks.
+        likely_reasons: share of the misfit that each error of the recording would explain, by name, the largest first.
+            Empty where the fit describes the points.
     """
 
     parameters: dict[str, Estimate]
@@ -82,6 +84,12 @@ class Identification:
     forces_before: list[dict[str, Tensor]] = field(default_factory=list, repr=False)
     forces_after: list[dict[str, Tensor]] = field(default_factory=list, repr=False)
     recordings: list[Recording] = field(default_factory=list, repr=False)
+    likely_reasons: dict[str, float] = field(default_factory=dict)
+
+    @property
+    def is_withdrawn(self) -> bool:
+        """Whether the fit means nothing, so that values and intervals of all fitted parameters are of no use."""
+        return bool(self.fit.get("withdrawn"))
 
     def as_dict(self) -> dict[str, Any]:
         """Return the content of identification.json."""
@@ -97,6 +105,7 @@ class Identification:
                 for episode, estimates in self.nuisances.items()
             },
             "profiles": {name: asdict(profile) for name, profile in self.profiles.items()},
+            "likely_reasons": self.likely_reasons,
             "convention": IDENTIFICATION_CONVENTION,
             "warnings": self.warnings,
             "history": [{name: nan_to_none(value) for name, value in entry.items()} for entry in self.history],
