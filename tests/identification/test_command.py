@@ -176,9 +176,18 @@ def test_the_table_names_distances_and_pictures(done):
     process, out = done
     content = json.loads((out / "identification.json").read_text())["fit"]
     for label, key in (("null", "chamfer_null"), ("start", "chamfer_before"), ("fitted", "chamfer_after")):
-        assert re.search(rf"^ +{label}.* {content[key]:.6f} ", process.stdout, re.MULTILINE), label
+        assert re.search(rf"^ +{label}.* {1e3 * content[key]:.3f} ", process.stdout, re.MULTILINE), label
     for name in ("fit.png", "distances.png", "parameters.png", "identification.json"):
         assert str(out / name) in process.stdout
+
+
+def test_notes_come_first_and_the_verdict_last(done):
+    process, _ = done
+    first, *_, last = process.stdout.splitlines()
+    assert first.startswith("1 episode(s)")
+    table = process.stdout.index("Parameters")
+    assert all(note.start() < table for note in re.finditer("^note: ", process.stdout, re.MULTILINE))
+    assert last == "verdict:  Identified: youngs_modulus, air.normal."
 
 
 def test_output_in_a_pipe_is_plain_text(done):

@@ -20,7 +20,7 @@ def test_a_wide_interval_of_a_positive_parameter_is_logarithmic(tmp_path):
         "signed": estimate(1.0, 0.1, -3.0, 5.0),
         "far start": estimate(1.0, 100.0, 0.9, 1.1),
     }
-    fit: Any = SimpleNamespace(parameters=shown)
+    fit: Any = SimpleNamespace(parameters=shown, is_withdrawn=False)
     figure = plot_parameters(fit)
     scales = dict(zip(shown, [axis.get_xscale() for axis in figure.axes], strict=True))
     assert scales == {"wide": "log", "narrow": "linear", "signed": "linear", "far start": "log"}

@@ -332,6 +332,7 @@ def _report(options: argparse.Namespace, fit: Identification, cloth: Cloth) -> i
     from ..identification.pictures import save_fit_pictures
     from ..identification.result import IDENTIFICATION_FILE_NAME
     from ..identification.tables import print_fit
+    from ..identification.verdict import describe_verdict
 
     folder = options.out
     note = replacement_note(folder / IDENTIFICATION_FILE_NAME)
@@ -342,4 +343,5 @@ def _report(options: argparse.Namespace, fit: Identification, cloth: Cloth) -> i
     print_fit(fit)
     print(f"result:   {path}{note}")
     print("pictures: " + ", ".join(str(p) for p in pictures))
+    print(f"verdict:  {describe_verdict(fit)}")
     return 0

@@ -121,6 +121,9 @@ def report(folder: Path, fit: FieldFit, cloth: Cloth) -> int:
     path = fit.save(folder)
     picture = save_figure(plot_fields(fit.fields, cloth), folder / "fields.png")
     clear_store(folder / PROGRESS_FOLDER_NAME)  # before anything is printed, to somebody who may stop reading
+    console = Console(highlight=False)
+    for warning in fit.warnings:
+        console.print(f"note: {warning}", style="yellow", markup=False)
     table = Table(title=f"{len(cloth.mesh.faces)} triangles", title_justify="left", box=box.SIMPLE_HEAD)
     for heading in ("field", "median", "5 %", "95 %", "unit"):
         table.add_column(heading, justify="left" if heading == "field" else "right")
@@ -128,12 +131,9 @@ def report(folder: Path, fit: FieldFit, cloth: Cloth) -> int:
     for name, values in fit.fields.items():
         low, middle, high = values.quantile(values.new_tensor([0.05, 0.5, 0.95])).tolist()
         table.add_row(name, f"{middle:.3g}", f"{low:.3g}", f"{high:.3g}", units[name])
-    console = Console(highlight=False)
     console.print(table)
     before, after = (1e3 * fit.fit[f"chamfer_{key}"] for key in ("before", "after"))
     if not math.isnan(after):
         console.print(f"Chamfer, one-sided, cloud to surface: {before:.2f} mm before, {after:.2f} mm fitted")
-    for warning in fit.warnings:
-        console.print(f"note: {warning}", style="yellow", markup=False)
     print(f"result:   {path}{note}\npicture:  {picture}")
     return 0

@@ -16,6 +16,7 @@ from .tension.prediction import PredictionBand, TensionPrediction, cross_validat
 from .tension.specimens import AbstractSpecimen, Response, Trellis, Uniaxial
 from .uncertainty.estimates import Estimate
 from .uncertainty.posterior_samples import sample_posterior
+from .verdict import describe_verdict
 
 __all__ = [
     "AbstractSpecimen",
@@ -36,6 +37,7 @@ __all__ = [
     "build_episode",
     "carry_rigidly",
     "cross_validate",
+    "describe_verdict",
     "fit_fields",
     "fit_tension",
     "identify",

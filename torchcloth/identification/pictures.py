@@ -175,14 +175,15 @@ def plot_parameters(fit: Identification) -> Any:
     axes = figure.subplots(len(shown), 1, squeeze=False)
     for axis, (name, e) in zip(axes[:, 0], shown.items(), strict=True):
         colour = AFTER_COLOUR if e.identifiable else NULL_COLOUR
-        axis.plot(e.ci95, [0, 0], color=colour, linewidth=4, alpha=0.4, solid_capstyle="butt")
-        axis.plot(e.value, 0, "o", color=colour)
+        if not fit.is_withdrawn:
+            axis.plot(e.ci95, [0, 0], color=colour, linewidth=4, alpha=0.4, solid_capstyle="butt")
+            axis.plot(e.value, 0, "o", color=colour)
         axis.plot(e.initial, 0, "x", color=BEFORE_COLOUR)
         note = {"prior": " (measured)"}.get(e.source, "") if e.identifiable else "\n(not identifiable)"
         axis.set_ylabel(f"{name}{note}\n[{e.unit}]", rotation=0, ha="right", va="center", fontsize=9)
         axis.set_yticks([])
         axis.spines[["left", "top", "right"]].set_visible(False)
-        ends = [*e.ci95, e.value, e.initial]
+        ends = [e.initial] if fit.is_withdrawn else [*e.ci95, e.value, e.initial]
         if min(ends) > 0 and max(ends) > MIN_LOG_AXIS_RATIO * min(ends):
             axis.set_xscale("log")
         axis.margins(x=0.1)

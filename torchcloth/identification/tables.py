@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
+from .display_units import in_display_unit
 from .result import Identification
 from .tension.fit import TensionFit
 from .uncertainty.estimates import Estimate
 
 if TYPE_CHECKING:
+    from rich.console import Console
     from rich.table import Table
 
 MIN_FIT_TABLE_COLUMNS = 112  # of the terminal
@@ -27,13 +30,14 @@ SOURCE_REMARKS = {"prior": "measured", "derived": "= E h", "held fixed": "held f
 
 
 def print_fit(fit: Identification) -> None:
-    """Print parameters, distances and warnings, 112 columns wide or more."""
+    """Print warnings, parameters and distances, 112 columns wide or more."""
     from rich.console import Console
 
     console = Console(highlight=False)
     console.width = max(console.width, MIN_FIT_TABLE_COLUMNS)
+    _print_notes(console, fit.warnings)
     absent = [name for name, e in fit.parameters.items() if e.source == "not in the model"]
-    console.print(_parameters(fit.parameters))
+    console.print(_parameters(fit.parameters, fit.is_withdrawn))
     if absent:
         console.print(f"Not in the model, because contact was left out: {', '.join(absent)}")
     _print_nuisances(console, fit)
@@ -47,28 +51,34 @@ def print_fit(fit: Identification) -> None:
         f"{f['iterations']:.0f} iterations{end}, {f['simulations']:.0f} simulations, {f['seconds']:.0f} s; "
         f"{points}{f['effective_observations']:.0f} effective observations"
     )
-    for warning in fit.warnings:
+
+
+def _print_notes(console: Console, warnings: Sequence[str]) -> None:
+    """Print what to mistrust in the numbers that follow."""
+    for warning in warnings:
         console.print(f"note: {warning}", style="yellow", markup=False)
 
 
 def _distances(f: dict[str, Any]) -> Table:
     """Distances of the null, the start and the end, and forces where there are any."""
     from rich import box
+    from rich.markup import escape
     from rich.table import Table
 
-    columns = {"Chamfer": "chamfer", "rms": "rms"} | ({"force rms [N]": "force_rms"} if "force_rms_after" in f else {})
-    title = "Distance cloud to surface, one-sided, metres"
-    table = Table(title=title, title_justify="left", box=box.SIMPLE_HEAD)
-    for heading in ("", *columns):
-        table.add_column(heading, justify="right" if heading else "left", no_wrap=True)
+    lengths = {"Chamfer [mm]": "chamfer", "rms [mm]": "rms"}
+    forces = {"force rms [N]": "force_rms"} if "force_rms_after" in f else {}
+    table = Table(title="Distance cloud to surface, one-sided", title_justify="left", box=box.SIMPLE_HEAD)
+    for heading in ("", *lengths, *forces):
+        table.add_column(escape(heading), justify="right" if heading else "left", no_wrap=True)
     for label, key in (
         ("null: carried rigidly, no force", "null"),
         ("start values", "before"),
         ("fitted values", "after"),
     ):
-        numbers = [f[f"{what}_{key}"] for what in columns.values()]
-        table.add_row(label, *("–" if math.isnan(number) else f"{number:.6f}" for number in numbers))
-    if "force_rms" in columns.values():
+        distances = [f"{1e3 * f[f'{what}_{key}']:.3f}" for what in lengths.values()]
+        errors = [f"{f[f'{what}_{key}']:.6f}" for what in forces.values()]
+        table.add_row(label, *("–" if cell == "nan" else cell for cell in (*distances, *errors)))
+    if forces:
         table.add_row("constant forces", "–", "–", f"{f['force_rms_constant']:.6f}")
     return table
 
@@ -107,18 +117,19 @@ def _print_nuisances(console, fit: Identification) -> None:
     """Print the nuisances, one line per episode."""
     for episode, estimates in fit.nuisances.items():
         if estimates:
-            numbers = [f"{name} {e.value:.2g} ± {e.std:.1g} {e.unit}" for name, e in estimates.items()]
+            numbers = [f"{name} {in_display_unit(e.unit, e.value, e.std)}" for name, e in estimates.items()]
             console.print(f"{episode}: {', '.join(numbers)}", markup=False)
 
 
 def print_tension(fit: TensionFit) -> None:
-    """Print parameters, errors of every table and warnings, 112 columns wide or more."""
+    """Print warnings, parameters and errors of every table, 112 columns wide or more."""
     from rich import box
     from rich.console import Console
     from rich.table import Table
 
     console = Console(highlight=False)
     console.width = max(console.width, MIN_FIT_TABLE_COLUMNS)
+    _print_notes(console, fit.warnings)
     console.print(_parameters(fit.parameters))
     table = Table(title="Errors, % of a table's largest reading", title_justify="left", box=box.SIMPLE_HEAD)
     for heading in ("table", "force rms: start", "fitted", "largest", "lateral strain rms: start", "fitted", "largest"):
@@ -127,12 +138,10 @@ def print_tension(fit: TensionFit) -> None:
         keys = [f"{kind}_{figure}" for kind in ("force", "lateral") for figure in ERROR_KEYS]
         table.add_row(str(k), *(f"{100 * errors[key]:.1f}" if key in errors else "" for key in keys))
     console.print(table)
-    for warning in fit.warnings:
-        console.print(f"note: {warning}", style="yellow", markup=False)
 
 
-def _parameters(estimates: dict[str, Estimate]) -> Table:
-    """Estimates of the parameters that are in the model."""
+def _parameters(estimates: dict[str, Estimate], withdrawn: bool = False) -> Table:
+    """Estimates of the parameters that are in the model; intervals of fitted ones only if the fit means something."""
     from rich import box
     from rich.table import Table
 
@@ -141,13 +150,13 @@ def _parameters(estimates: dict[str, Estimate]) -> Table:
         table.add_column(heading, justify=side, no_wrap=True)  # type: ignore[arg-type]
     for name, e in estimates.items():
         if e.source != "not in the model":
-            table.add_row(name, f"{e.initial:.4g}", *_statement(e), e.unit, _remark(e))
+            table.add_row(name, f"{e.initial:.4g}", *_statement(e, withdrawn), e.unit, _remark(e))
     return table
 
 
-def _statement(e: Estimate) -> tuple[str, str, str]:
+def _statement(e: Estimate, withdrawn: bool) -> tuple[str, str, str]:
     """(value, error, interval): no number without its error, and none where the data say nothing."""
-    interval = f"{e.ci95[0]:.3g} … {e.ci95[1]:.3g}"
+    interval = "–" if withdrawn and e.source != "held fixed" else f"{e.ci95[0]:.3g} … {e.ci95[1]:.3g}"
     if not e.identifiable:
         return "–", "–", interval
     digits = math.floor(math.log10(abs(e.value) / e.std)) + 2 if e.std > 0 and e.value else 4
