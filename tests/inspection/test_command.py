@@ -1,13 +1,16 @@
 """``torchcloth inspect`` as a user meets it."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
+from helpers.command_line import write_twin
 from helpers.swinging_cloth import make_episode, make_markers
 
 from torchcloth import recordings
 from torchcloth.cli import main
+from torchcloth.cli.inspect import describe_verdict
 
 
 @pytest.fixture
@@ -84,3 +87,38 @@ def test_depth_images_are_summarised_and_a_damaged_one_is_one_line(tmp_path, cap
     (folder / "cam0" / "depth" / "000001.png").write_bytes(b"no image")
     assert main(["inspect", str(folder)]) == 2
     assert capsys.readouterr().err.count("\n") == 1
+
+
+@pytest.fixture(scope="module")
+def twin(tmp_path_factory):
+    """Folder of an episode that can be fitted."""
+    return write_twin(tmp_path_factory.mktemp("episodes") / "twin")
+
+
+def test_the_last_line_says_that_identify_can_begin(twin, capsys):
+    assert main(["inspect", str(twin)]) == 0
+    printed = capsys.readouterr().out
+    assert printed.splitlines()[-1] == "verdict: Ready for identify. The note above says what to mistrust."
+    assert printed.index("Streams") < printed.index("note: no lag") < printed.index("Findings")
+
+
+def test_the_last_line_says_what_must_be_mended_first(twin, tmp_path, capsys):
+    """As identify says it: here the unit of the points, and grippers that never close."""
+    good = recordings.read(twin)
+    let_go = {name: replace(g, closed=np.zeros(len(g.t), bool)) for name, g in good.grippers.items()}
+    small = replace(good.points, xyz=1e-3 * np.asarray(good.points.xyz))
+    folder = recordings.write(replace(good, grippers=let_go, points=small, path=None), tmp_path / "spoiled")
+    assert main(["inspect", str(folder)]) == 0
+    line = capsys.readouterr().out.splitlines()[-1]
+    assert line.startswith("verdict: 2 problems must be mended first: (1) spoiled: the cloud is 0.00")
+    assert "; (2) " in line
+    assert "nothing holds the cloth; got grippers that are never closed" in line
+    assert main(["identify", str(folder), "--out", str(tmp_path / "out")]) == 2
+    assert capsys.readouterr().err.strip().removeprefix("torchcloth: ") in line
+
+
+def test_the_verdict_in_words():
+    assert describe_verdict([], []) == "Ready for identify."
+    assert describe_verdict([], ["a", "b"]) == "Ready for identify. The 2 notes above say what to mistrust."
+    assert describe_verdict(["no motion"], ["a"]) == "1 problem must be mended first: no motion."
+    assert describe_verdict(["a", "b"], []) == "2 problems must be mended first: (1) a; (2) b."

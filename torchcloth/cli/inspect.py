@@ -4,10 +4,16 @@ from __future__ import annotations
 
 import argparse
 import json
-from typing import Any
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
 
 from .._utils.files import write_text
+from ..errors import TorchclothError
 from .output_paths import check_output_folder, check_outside_episodes, output_path, replacement_note
+
+if TYPE_CHECKING:
+    from ..recordings import Recording
 
 INSPECTION_FILE_NAME = "inspection.json"
 
@@ -33,7 +39,10 @@ def _inspect(options: argparse.Namespace) -> int:
         check_outside_episodes(options.out, options.episode)
         check_output_folder(options.out)
     with Console(stderr=True).status(escape(f"inspecting {options.episode}")):
-        report = inspection.inspect(recordings.read(options.episode))
+        recording = recordings.read(options.episode)
+        report = inspection.inspect(recording)
+        problems, warnings = check_for_fit(recording)
+    report = replace(report, notes=[*report.notes, *warnings])
     text = json.dumps(report.as_dict(), indent=1, allow_nan=False) + "\n"
     written = ""
     if options.out is not None:  # before printing, which fails if the reader closes the pipe
@@ -44,5 +53,49 @@ def _inspect(options: argparse.Namespace) -> int:
         print(text, end="")
     else:
         inspection.show(report)
-        print(written, end="")
+        print(f"{written}verdict: {describe_verdict(problems, report.notes)}")
     return 0
+
+
+def check_for_fit(recording: Recording) -> tuple[list[str], list[str]]:
+    """Make the checks that ``identify`` makes before its first simulation.
+
+    Returns:
+        Why ``identify`` would refuse the recording, and what it would warn of, in sentences.
+    """
+    from ..episodes.observed import build_episode, check_is_held
+    from ..episodes.recorded_cloth import build_cloth
+    from ..inspection.corrections import check_recording
+    from ..recordings.size_checks import check_size
+
+    warnings: list[str] = []
+
+    def build() -> None:
+        episode = build_episode(build_cloth(recording), check_recording(recording).recording)
+        warnings.extend(episode.data_warnings())
+
+    problems = []
+    for check in (lambda: check_size(recording), lambda: check_is_held(recording), build):
+        try:
+            check()
+        except TorchclothError as error:
+            problems.append(str(error))
+    return list(dict.fromkeys(problems)), warnings
+
+
+def describe_verdict(problems: Sequence[str], notes: Sequence[str]) -> str:
+    """Return in one line whether ``identify`` can use a recording, and what must be mended first if it cannot.
+
+    Args:
+        problems: why it would refuse the recording.
+        notes: what else was printed to mistrust.
+    """
+    if len(problems) == 1:
+        return f"1 problem must be mended first: {problems[0]}."
+    if problems:
+        listed = "; ".join(f"({number}) {problem}" for number, problem in enumerate(problems, 1))
+        return f"{len(problems)} problems must be mended first: {listed}."
+    if not notes:
+        return "Ready for identify."
+    which = "The note above says" if len(notes) == 1 else f"The {len(notes)} notes above say"
+    return f"Ready for identify. {which} what to mistrust."

@@ -17,16 +17,16 @@ STAGE_TEXT = {"outliers": "far from their neighbours", "clusters": "in small clu
 
 
 def show(report: Inspection) -> None:
-    """Print streams, lag, noise, frames and notes, at least 100 columns wide."""
+    """Print streams, notes, lag, noise and frames, at least 100 columns wide."""
     from rich.console import Console
 
     console = Console(highlight=False)
     console.width = max(console.width, MIN_CONSOLE_WIDTH)
     console.print(f"{report.recording.path or 'recording'}: {report.recording.provenance}", style="bold", markup=False)
     _streams(console, report)
-    _findings(console, report)
     for note in report.notes:
         console.print(f"note: {note}", style="yellow", markup=False)
+    _findings(console, report)
 
 
 def _table(title: str, columns: str) -> Any:
