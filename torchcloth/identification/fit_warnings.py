@@ -11,6 +11,7 @@ from torch import Tensor
 
 from ..cloth import Cloth
 from ..episodes.observed import Episode
+from .display_units import in_display_unit
 from .nuisances import NuisanceSlice
 from .uncertainty.estimates import EstimateSet
 
@@ -137,13 +138,14 @@ def nuisance_warnings(
     for episode, slices in zip(episodes, nuisance_slices, strict=True):
         for s in slices:
             conflicts = [
-                f"{name} {value:.2g} {unit}"
+                f"{name} {in_display_unit(unit, value)}"
                 for name, unit, std, value in zip(s.names, s.units, s.stds, raw[s.index].tolist(), strict=True)
                 if abs(value) > FIT_WARNING_THRESHOLDS.max_nuisance_prior_stds * std
             ]
             if conflicts:
                 warnings.append(
-                    f"{episode.name}: {', '.join(conflicts)} conflict with the prior ({s.stds[0]:.2g} {s.units[0]}): "
+                    f"{episode.name}: {', '.join(conflicts)} conflict with the prior "
+                    f"({in_display_unit(s.units[0], s.stds[0])}): "
                     "another error, e.g. of the camera's or the robot's pose, may look the same"
                 )
     return warnings
