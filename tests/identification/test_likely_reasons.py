@@ -110,7 +110,7 @@ def test_a_nuisance_far_outside_of_its_prior_is_named(recording):
     raised = replace(recording, points=replace(points, xyz=points.xyz + np.array([0.0, 0.0, 5e-3])))
     model = twins.build_cloth_at(recording, youngs_modulus=4e4)
     fit = identify(model, raised, PARAMETERS, nuisances={"grasp": 1e-3}, iterations=8, checks=False)
-    assert any("conflict with the prior" in w and "grasp.left.z" in w for w in fit.warnings)
+    assert any("mm conflict with the prior" in w and "grasp.left.z" in w for w in fit.warnings)
 
 
 def test_reasons_that_are_as_likely_have_their_remedies():
