@@ -13,6 +13,7 @@ from safetensors import safe_open
 from safetensors.torch import save_file
 from torch import Tensor
 
+from .._utils.files import write_atomically
 from .._utils.torch_modes import isolated_grad_mode
 from ..boundaries import Grasp
 from ..boundaries.motion import interpolate_poses
@@ -59,7 +60,8 @@ def save_network(network: PoseEstimator, path: Path) -> None:
     """Write the weights of a network, in half precision, and its size."""
     tensors = {name: value.detach().half().contiguous() for name, value in network.state_dict().items()}
     metadata = {"format": NETWORK_FORMAT, "config": json.dumps(network.description)}
-    save_file(tensors, path, metadata)
+    with write_atomically(path) as part:
+        save_file(tensors, part, metadata)
 
 
 def load_network(path: Path | None = None) -> PoseEstimator:

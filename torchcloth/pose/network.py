@@ -175,11 +175,15 @@ class PoseEstimator(nn.Module):
         return PosePrediction(x[:, 0], std[:, 0], v, x, std, weights, log_fabric, spread * tokens.fabric[:, 1].exp())
 
     def compute_stages(self, inputs: PoseInputs, truth: Tensor) -> StageOutputs:
-        """Return the answers of all stages, of the hypothesis nearest to the truth [B, V, 3] m, for training."""
+        """Return the answers of all stages, for training.
+
+        The hypothesis nearest to the truth [B, V, 3] m is refined, or the likeliest one where the truth is NaN.
+        """
         tokens = self._encode(inputs)
         with torch.no_grad():
             apart = (tokens.hypotheses - tokens.frame.to_scene(truth)[:, None]).norm(dim=-1)
-            chosen = masked_mean(apart, inputs.exists[:, None]).argmin(-1)
+            apart = masked_mean(apart, inputs.exists[:, None])
+            chosen = torch.where(apart.isfinite().all(-1), apart.argmin(-1), tokens.logits.argmax(-1))
         stages, h = self._refine(tokens, chosen)
         v = (
             self.to_velocity(h)
