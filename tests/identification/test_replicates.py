@@ -195,7 +195,7 @@ def test_nuisances_of_an_episode_do_not_scatter():
     at = minimise(problem, torch.zeros(1 + episodes), 30, lambda _: False)
     objective = SimpleNamespace(
         problem=lambda: problem,
-        episodes=[SimpleNamespace(needs_settling=False)] * episodes,
+        episodes=[SimpleNamespace(is_first_shape_measured=False)] * episodes,
         episode_of_rows=lambda linear: of_part,
         unknowns=[None],
         start=torch.zeros(1 + episodes),

@@ -89,7 +89,7 @@ class Rippling:
 
     nuisances, blocks = (), RESIDUAL_BLOCKS[:1]
     cloth = SimpleNamespace(boundaries={})
-    episodes = (SimpleNamespace(needs_settling=False, noise_std=None),)
+    episodes = (SimpleNamespace(is_first_shape_measured=False, noise_std=None),)
 
     def __init__(self, seed: int, blind: bool = False) -> None:
         generator = torch.Generator().manual_seed(seed)
@@ -150,6 +150,30 @@ def test_simulations_around_a_point_see_through_ripples():
     assert 0.6 < float(z.std()) < 1.4
     assert float(torch.stack(stds).mean()) < 0.2
     assert float(result.influence.position[0]) == pytest.approx(math.sqrt(0.5 * (1 + 4)), rel=1e-6)
+
+
+def test_rounds_end_where_nothing_could_become_identifiable():
+    rounds = []
+    result = statistical_linearisation.fit_by_sampling(
+        Rippling(0), FAILED, None, 8, rounds.append, None, lambda raw, covariance: False
+    )
+    assert len(rounds) == 1
+    assert not result.final.converged
+
+
+def test_rounds_that_know_less_and_come_no_nearer_end_the_search(monkeypatch):
+    """Errors that grow would make any move small: such a round has not converged either."""
+    errors, rounds = iter([0.1, 0.2, 100.0, 100.0, 100.0]), []
+    monkeypatch.setattr(
+        statistical_linearisation.levenberg_marquardt,
+        "inflate_covariance",
+        lambda covariance, variances: torch.eye(3, dtype=torch.float64) * next(errors) ** 2,
+    )
+    problem = Rippling(0)
+    monkeypatch.setattr(problem, "mean_distance", lambda raw: 1.0, raising=False)
+    result = statistical_linearisation.fit_by_sampling(problem, FAILED, None, 8, rounds.append)
+    assert len(rounds) == 3
+    assert not result.final.converged
 
 
 def test_what_nothing_tells_stays_open_under_ripples():

@@ -23,7 +23,7 @@ from ..recordings.size_checks import check_size
 from ..robots import list_closing_grippers, replay  # pyright: ignore[reportMissingImports] - mapped from robots/ at installation
 from ..types import Trajectory
 from . import streams
-from .recorded_cloth import compute_initial_vertices
+from .recorded_cloth import compute_initial_velocities, compute_initial_vertices
 
 DEFAULT_FRAME_RATE_HZ = 20.0  # of episodes without measurements
 MIN_FRAMES_OF_PART = 4  # of the beginning of an episode
@@ -57,6 +57,7 @@ class Episode:
         readings_after_last_frame: number of force readings after the last frame with points or markers, which are not
             simulated either.
         idle_grippers: names of grippers that close and hold nothing: the cloth has no grasp of their name.
+        initial_velocity: [V, 3] m/s, of the vertices at the first frame; None: the cloth is at rest there.
     """
 
     name: str
@@ -74,12 +75,14 @@ class Episode:
     frames_after_motion: int = 0
     readings_after_last_frame: int = 0
     idle_grippers: tuple[str, ...] = ()
+    initial_velocity: Tensor | None = None
 
     def fingerprint_parts(self) -> list[object]:
         """List everything that simulations of it, and their comparison with the data, depend on."""
         data = [
             self.times,
             self.initial,
+            self.initial_velocity,
             self.needs_settling,
             *self.clouds,
             self.markers,
@@ -93,6 +96,11 @@ class Episode:
     def observed_count(self) -> int:
         """Number of frames that may have data."""
         return len(self.times) - self.unobserved_count
+
+    @property
+    def is_first_shape_measured(self) -> bool:
+        """Whether ``initial`` has the errors of a measurement."""
+        return self.needs_settling or self.initial_velocity is not None
 
     @property
     def lookahead(self) -> float:
@@ -256,6 +264,7 @@ def build_episode(cloth: Cloth, recording: Recording, rate: float | None = None)
         raise RecordingError(f"{name}: no motion for grasp {missing[0]!r}", got=got)
     times, frames_after_motion = _frame_times(name, recording, motion, grasps, rate)
     initial = compute_initial_vertices(name, cloth, recording).to(dtype)
+    velocity = compute_initial_velocities(cloth, recording)
     places = _gripper_places(cloth, motion, initial, times[0])
     _check_not_exchanged(name, places)
     _check_gripper_distance(name, places)
@@ -268,7 +277,7 @@ def build_episode(cloth: Cloth, recording: Recording, rate: float | None = None)
         times=torch.as_tensor(times),
         clouds=streams.gather_clouds(recording, times, dtype),
         initial=initial,
-        needs_settling=recording.cloth.initial_vertices is not None,
+        needs_settling=recording.cloth.initial_vertices is not None and velocity is None,
         noise_std=recording.observation_noise_std,
         markers=markers,
         marker_places=None if markers is None or uv is None else streams.locate_on_pattern(cloth.mesh, uv),
@@ -277,6 +286,7 @@ def build_episode(cloth: Cloth, recording: Recording, rate: float | None = None)
         frames_after_motion=frames_after_motion,
         idle_grippers=tuple(key for key in list_closing_grippers(recording) if key not in grasps),
         readings_after_last_frame=int(is_late_reading.sum()),
+        initial_velocity=None if velocity is None else velocity.to(dtype),
     )
 
 

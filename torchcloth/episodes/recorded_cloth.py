@@ -152,6 +152,17 @@ def compute_initial_vertices(name: str, cloth: Cloth, recording: Recording) -> T
     return transfer_vertices(cloth.mesh, recording, torch.as_tensor(initial))
 
 
+def compute_initial_velocities(cloth: Cloth, recording: Recording) -> Tensor | None:
+    """Return the velocities [V, 3] m/s of the vertices at the first frame; None: the cloth is at rest there.
+
+    Args:
+        cloth: whose vertices are wanted; they are those of ``compute_initial_vertices``.
+        recording: the episode.
+    """
+    velocities = recording.cloth.initial_velocities
+    return None if velocities is None else transfer_vertices(cloth.mesh, recording, torch.as_tensor(velocities))
+
+
 def transfer_vertices(mesh: Mesh, recording: Recording, initial: Tensor) -> Tensor:
     """Interpolate vertex positions of an episode's mesh to a mesh with the same triangles at other pattern places.
 

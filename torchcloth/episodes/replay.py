@@ -35,8 +35,25 @@ class Frames(NamedTuple):
     rim_offset: Tensor
 
 
+class StateModes(NamedTuple):
+    """M directions in which the state at the first frame may change.
+
+    Attributes:
+        x: [M, V, 3] m per unit.
+        v: [M, V, 3] m/s per unit.
+    """
+
+    x: Tensor
+    v: Tensor
+
+
+def first_state(cloth: Cloth, episode: Episode) -> ClothState:
+    """Return the state at the first frame, before it settles where it does."""
+    return cloth.state(episode.initial, episode.initial_velocity)
+
+
 class Replay(nn.Module):
-    """A cloth driven through an episode: it settles, then follows the motion."""
+    """A cloth driven through an episode: it settles, unless it moves at the first frame, then follows the motion."""
 
     def __init__(self, cloth: Cloth) -> None:
         super().__init__()
@@ -44,7 +61,7 @@ class Replay(nn.Module):
 
     def forward(self, episode: Episode, dt: float | None = None) -> Rollout:
         """Simulate the episode at its frame times."""
-        state = self.cloth.state(episode.initial)
+        state = first_state(self.cloth, episode)
         if episode.needs_settling:
             start = float(episode.times[0])
             state = self.cloth.settle(state, episode.motion, start=start, duration=SETTLE_TIME_S)
@@ -66,7 +83,7 @@ def simulate_with_tangents(
     raw: Tensor,
     episode: Episode,
     dt: float | None = None,
-    modes: Tensor | None = None,
+    modes: StateModes | None = None,
     by_unknowns: bool = True,
 ) -> tuple[Frames, Frames]:
     """Simulate the episode with exact derivatives, in one forward pass.
@@ -79,13 +96,13 @@ def simulate_with_tangents(
         raw: [K] unconstrained values.
         episode: what drives the cloth.
         dt: largest substep [s]; None: the stable one.
-        modes: [M, V, 3] m, changes of the initial shape along which there are derivatives, too.
+        modes: changes of the first state along which there are derivatives, too.
         by_unknowns: whether there are derivatives by the unknowns; without them there must be modes.
 
     Returns:
         The frames, and their derivatives by the unknowns, then along the modes, [K + M, ...].
     """
-    count, extra = len(unknowns) if by_unknowns else 0, 0 if modes is None else len(modes)
+    count, extra = len(unknowns) if by_unknowns else 0, 0 if modes is None else len(modes.x)
     value = raw.detach().to(episode.initial)
     directions = torch.eye(count + extra, len(unknowns), dtype=episode.initial.dtype)
     entries = {f"cloth.{key}": v for key, v in make_state_entries(unknowns, value).items()}
@@ -102,7 +119,7 @@ class _ReplayWithTangents(nn.Module):
         self.cloth = cloth
 
     def forward(self, episode: Episode, along: Directions, dt: float | None) -> tuple[Rollout, Rollout]:
-        state, settle = self.cloth.state(episode.initial), SETTLE_TIME_S if episode.needs_settling else 0.0
+        state, settle = first_state(self.cloth, episode), SETTLE_TIME_S if episode.needs_settling else 0.0
         return self.cloth.sensitivities(state, episode.motion, episode.times, along=along, dt=dt, settle=settle)
 
 
@@ -117,14 +134,15 @@ def frames_from_rollout(rollout: Rollout) -> Frames:
     return Frames(rollout.x, rollout.v, rollout.wrench, rollout.x.new_zeros(rollout.x.shape[:-2]))
 
 
-def initial_state_tangents(cloth: Cloth, episode: Episode, modes: Tensor, before: int) -> ClothState:
-    """Compute tangents of the first state: ``before`` zero directions, then the modes [M, V, 3] m."""
-    rest = cloth.state(episode.initial)
+def initial_state_tangents(cloth: Cloth, episode: Episode, modes: StateModes, before: int) -> ClothState:
+    """Compute tangents of the first state: ``before`` zero directions, then the M modes."""
+    rest = first_state(cloth, episode)
     mode_tangents = []
     with torch.no_grad():
-        for mode in modes:
+        for x, v in zip(modes.x, modes.v, strict=True):
             with forward_ad.dual_level():
-                state = cloth.state(forward_ad.make_dual(rest.x, mode.to(rest.x).contiguous()))
+                position = forward_ad.make_dual(rest.x, x.to(rest.x).contiguous())
+                state = cloth.state(position, forward_ad.make_dual(rest.v, v.to(rest.x).contiguous()))
                 mode_tangents.append(state.map(_tangent))
     zeros = rest.map(lambda field: field.new_zeros(before, *field.shape))
 

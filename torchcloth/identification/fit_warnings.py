@@ -114,7 +114,7 @@ def fit_warnings(
             f"sensor noise ({max(noise) * 1e3:.1f} mm): the model misses something, and the standard errors do not "
             "cover it"
         )
-    if not all(e.needs_settling for e in episodes):
+    if not all(e.is_first_shape_measured for e in episodes):
         warnings.append(
             "an episode has no initial_vertices: the rest mesh, as placed in the file, was taken as the first frame"
         )

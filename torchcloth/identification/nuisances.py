@@ -61,6 +61,10 @@ class AbstractNuisance(ABC):
         """Return how the numbers move the cloth at the first frame, [k, V, 3] m per unit; None: not at all."""
         return None
 
+    def initial_velocity_modes(self, cloth: Cloth, episode: Episode) -> Tensor | None:
+        """Return the velocities at the first frame that the numbers add, [k, V, 3] m/s per unit; None: not at all."""
+        return None
+
     def observe(self, frames: Frames, values: Tensor, episode: Episode) -> Frames:
         """Return the frames as an observer with these errors sees them; differentiable."""
         return frames
@@ -162,22 +166,33 @@ class GraspOffset(AbstractNuisance):
         return torch.einsum("gv,ab->gavb", weight, torch.eye(3).to(weight)).flatten(0, 1)
 
 
-class InitialShapeOffset(AbstractNuisance):
-    """Error of the first shape: constant and linear fields that vanish where the cloth is held."""
+class _FirstStateOffset(AbstractNuisance):
+    """Error of the first state: fields along three axes that vanish where the cloth is held.
 
-    name, unit, std = "shape", "m", 0.005
+    Args:
+        std: of the prior of each number; None: the default.
+        fields: [M, V], the coarsest first; None: a constant one and two linear ones, along the principal axes at rest.
+    """
+
+    def __init__(self, std: float | None = None, fields: Tensor | None = None) -> None:
+        super().__init__(std)
+        self.fields = fields
 
     def number_names(self, cloth: Cloth, episode: Episode) -> list[str]:
-        """Return names of three fields along three axes."""
-        return [f"{field}.{a}" for field in ("mean", "first", "second") for a in AXIS_NAMES]
+        """Return names of the fields along three axes."""
+        names = ("mean", "first", "second") if self.fields is None else map(str, range(len(self.fields)))
+        return [f"{field}.{a}" for field in names for a in AXIS_NAMES]
 
-    def initial_shape_modes(self, cloth: Cloth, episode: Episode) -> Tensor:
-        """Return fields along the principal axes at rest, of unit size at the cloth's ends."""
+    def _modes(self, cloth: Cloth, episode: Episode) -> Tensor:
+        """[3 M, V, 3] of unit size where they are largest."""
         rest = _pattern(cloth).to(episode.initial)
-        centred = rest - rest.mean(0)
-        axes = torch.linalg.svd(centred, full_matrices=False)[2][:2]
-        along = (centred @ axes.mT).mT
-        fields = torch.cat([torch.ones_like(along[:1]), along / along.abs().amax(1, keepdim=True)])
+        if self.fields is None:
+            centred = rest - rest.mean(0)
+            axes = torch.linalg.svd(centred, full_matrices=False)[2][:2]
+            along = (centred @ axes.mT).mT
+            fields = torch.cat([torch.ones_like(along[:1]), along / along.abs().amax(1, keepdim=True)])
+        else:
+            fields = self.fields.to(rest)
         for index in _grasped_vertices(cloth).values():
             distance = torch.cdist(rest, rest[index]).amin(1)
             fields = fields * (distance / distance.max())
@@ -185,8 +200,41 @@ class InitialShapeOffset(AbstractNuisance):
         return torch.einsum("mv,ab->mavb", fields, torch.eye(3).to(fields)).flatten(0, 1)
 
 
+class InitialShapeOffset(_FirstStateOffset):
+    """Error of the first shape."""
+
+    name, unit, std = "shape", "m", 0.005
+
+    def initial_shape_modes(self, cloth: Cloth, episode: Episode) -> Tensor:
+        """Return the fields as displacements."""
+        return self._modes(cloth, episode)
+
+
+class InitialVelocityOffset(_FirstStateOffset):
+    """Error of the velocities at the first frame, of an episode that begins in motion."""
+
+    name, unit, std = "velocity", "m/s", 0.2
+
+    def number_names(self, cloth: Cloth, episode: Episode) -> list[str]:
+        """Return names of the fields along three axes; none for a cloth at rest."""
+        return [] if episode.initial_velocity is None else super().number_names(cloth, episode)
+
+    def initial_velocity_modes(self, cloth: Cloth, episode: Episode) -> Tensor | None:
+        """Return the fields as velocities."""
+        return None if episode.initial_velocity is None else self._modes(cloth, episode)
+
+
 NUISANCE_KINDS: dict[str, type[AbstractNuisance]] = {
-    kind.name: kind for kind in (ClockOffset, CameraOffset, ForceTare, RimOffset, GraspOffset, InitialShapeOffset)
+    kind.name: kind
+    for kind in (
+        ClockOffset,
+        CameraOffset,
+        ForceTare,
+        RimOffset,
+        GraspOffset,
+        InitialShapeOffset,
+        InitialVelocityOffset,
+    )
 }
 
 

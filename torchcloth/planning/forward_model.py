@@ -10,7 +10,7 @@ from torch import Tensor
 
 from ..cloth import Cloth
 from ..episodes.observed import DEFAULT_FRAME_RATE_HZ, Episode, build_episode
-from ..episodes.replay import SETTLE_TIME_S, Frames, frames_from_rollout
+from ..episodes.replay import SETTLE_TIME_S, Frames, first_state, frames_from_rollout
 from ..episodes.world import MAX_CLOCK_DELAY_S, World, WorldModel
 from ..recordings import Recording
 from ..simulation.sensitivities import Directions
@@ -59,7 +59,7 @@ class ForwardModel:
         with torch.no_grad():
             self._first = self._commanded({m.name: m.trajectory(m.zero_waypoints) for m in motions})
             driven = self.world.apply_motion(self._first)
-            state = self.world.cloth.state(driven.initial)
+            state = first_state(self.world.cloth, driven)
             if driven.needs_settling:  # all motions start at the recorded pose, so the settled state is the same
                 state = self.world.cloth.settle(state, driven.motion, start=span.begin, duration=SETTLE_TIME_S)
             self.state = state

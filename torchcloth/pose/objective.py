@@ -14,7 +14,14 @@ from torch import Tensor, nn
 from ..cloth import Cloth
 from ..effects import BodyForce
 from ..episodes.observed import Episode
-from ..episodes.replay import SETTLE_TIME_S, Frames, frames_from_rollout, initial_state_tangents, map_frames
+from ..episodes.replay import (
+    SETTLE_TIME_S,
+    Frames,
+    first_state,
+    frames_from_rollout,
+    initial_state_tangents,
+    map_frames,
+)
 from ..episodes.unknowns import Unknown, make_state_entries
 from ..errors import InvalidInput, SimulationDiverged
 from ..identification.estimators import levenberg_marquardt
@@ -184,7 +191,7 @@ class CorrectedObjective(Objective):
         episode = replace(episode, times=episode.times[:frames])
         fabric = make_state_entries(self.unknowns, raw[: len(self.unknowns)].to(episode.initial))
         fields = self.force.acceleration_field(raw[self.force_slice].to(episode.initial))
-        state = self.cloth.state(episode.initial)
+        state = first_state(self.cloth, episode)
         for w, (_, times) in enumerate(self._windows(episode)):
             values = {**fabric, CORRECTION_STATE_KEY: fields[w]}
             entries = {f"cloth.{key}": value for key, value in values.items()}
@@ -219,15 +226,13 @@ class CorrectedObjective(Objective):
 
     def _tangents_without_nuisances(self, raw: Tensor, i: int) -> tuple[Frames, Frames]:
         """The episode and its derivatives by all unknowns; a later force does not move an earlier window."""
-        placed_modes, episode = self._initial_shape_modes(i), self._initial_episode(raw, i)
-        no_modes = episode.initial.new_zeros(0, *episode.initial.shape)
-        modes = torch.cat([m for _, m in placed_modes]) if placed_modes else no_modes
+        (mode_columns, modes), episode = self._first_state_modes(i), self._initial_episode(raw, i)
         count, per_window = len(self.unknowns), self.force.count_per_window
-        columns = [*range(count), *(k for index, _ in placed_modes for k in range(index.start, index.stop))]
+        columns = [*range(count), *mode_columns]
         fabric = make_state_entries(self.unknowns, raw[:count].to(episode.initial))
         fields = self.force.acceleration_field(raw[self.force_slice].to(episode.initial))
         basis = torch.einsum("mv,ab->mavb", self.force.modes, torch.eye(3)).flatten(0, 1).to(episode.initial)
-        state = self.cloth.state(episode.initial)
+        state = first_state(self.cloth, episode)
         state_tangents = initial_state_tangents(self.cloth, episode, modes, count)
         parts, derivative_parts = [], []
         for w, (_, times) in enumerate(self._windows(episode)):

@@ -32,6 +32,8 @@ class ClothInfo:
         uv: m, pattern coordinates (u warp, v weft): [V, 2], or [F, 3, 2] of sewn panels.
         initial_vertices: m, world, at the first frame; measured, with error. [V, 3], or [M, N, 3] of a regular grid on
             a sheet without a mesh, from pattern corner to corner, along the width first.
+        initial_velocities: [V, 3] m/s, world, of the initial vertices; measured, with error. None: the cloth is at rest
+            at the first frame.
         nominal: data-sheet values: a start for fits, possibly wrong.
         extra: unknown keys.
     """
@@ -44,6 +46,7 @@ class ClothInfo:
     faces: np.ndarray | None = None
     uv: np.ndarray | None = None
     initial_vertices: np.ndarray | None = None
+    initial_velocities: np.ndarray | None = None
     nominal: dict[str, Any] = field(default_factory=dict)
     extra: dict[str, Any] = field(default_factory=dict)
 

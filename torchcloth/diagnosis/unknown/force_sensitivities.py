@@ -13,7 +13,7 @@ from torch import Tensor
 
 from ...cloth import Cloth
 from ...episodes.observed import Episode
-from ...episodes.replay import SETTLE_TIME_S, Frames, frames_from_rollout, map_frames
+from ...episodes.replay import SETTLE_TIME_S, Frames, first_state, frames_from_rollout, map_frames
 from ...episodes.world import ObservationTransform, World
 from ...pose.objective import CORRECTION_STATE_KEY, add_correction_effect, concatenate_windows
 from ...simulation.sensitivities import Directions
@@ -58,7 +58,7 @@ def differentiate_pulses(
 
 def _simulate_tangents(cloth: Cloth, episode: Episode, pulses: ForcePulses, dt: float | None) -> tuple[Frames, Frames]:
     """Simulate window after window; a direction joins when it first acts."""
-    count, state = pulses.fields.shape[1], cloth.state(episode.initial)
+    count, state = pulses.fields.shape[1], first_state(cloth, episode)
     is_active = pulses.fields.abs().amax((2, 3)).cummax(0).values > 0
     is_active[:, 0] = True  # at least one
     was_active, tangent = torch.zeros(count, dtype=torch.bool), None

@@ -15,7 +15,7 @@ from ...cloth import Cloth
 from ...episodes.cloth_fingerprint import cloth_fingerprint_parts
 from ...episodes.observed import Episode
 from ...episodes.observed_surface import build_surface
-from ...episodes.replay import Frames, map_frames, simulate, simulate_with_tangents
+from ...episodes.replay import Frames, StateModes, map_frames, simulate, simulate_with_tangents
 from ...episodes.unknowns import Unknown
 from ...errors import InvalidInput, SimulationDiverged, UnstableStep
 from ...parameters import PhysicalParameter
@@ -227,27 +227,38 @@ class Objective:
             frames = s.nuisance.observe(frames, raw[s.index].to(frames.x), self.episodes[i])
         return frames
 
-    def _initial_shape_modes(self, i: int) -> list[tuple[slice, Tensor]]:
-        modes = (
-            (s.index, s.nuisance.initial_shape_modes(self.cloth, self.episodes[i])) for s in self.nuisance_slices[i]
-        )
-        return [(index, m) for index, m in modes if m is not None]
+    def _first_state_modes(self, i: int) -> tuple[list[int], StateModes]:
+        """(indices of the unknowns that change the first state, changes by their units)."""
+        episode, columns = self.episodes[i], []
+        none = episode.initial.new_zeros(0, *episode.initial.shape)
+        x, v = [none], [none]
+        for s in self.nuisance_slices[i]:
+            shape = s.nuisance.initial_shape_modes(self.cloth, episode)
+            velocity = s.nuisance.initial_velocity_modes(self.cloth, episode)
+            given = shape if velocity is None else velocity
+            if given is not None:
+                columns += range(s.index.start, s.index.stop)
+                x.append(torch.zeros_like(given) if shape is None else shape)
+                v.append(torch.zeros_like(given) if velocity is None else velocity)
+        return columns, StateModes(torch.cat(x), torch.cat(v))
 
     def _initial_episode(self, raw: Tensor, i: int) -> Episode:
-        """The episode with its first shape moved by the nuisances."""
-        episode = self.episodes[i]
-        for index, modes in self._initial_shape_modes(i):
-            shift = torch.einsum("k,kvc->vc", raw[index].to(modes), modes)
-            episode = replace(episode, initial=episode.initial + shift)
-        return episode
+        """The episode with its first state changed by the nuisances."""
+        episode, (columns, modes) = self.episodes[i], self._first_state_modes(i)
+        if not columns:
+            return episode
+        values = raw[columns].to(episode.initial)
+        velocity = episode.initial_velocity
+        if velocity is not None:
+            velocity = velocity + torch.einsum("k,kvc->vc", values, modes.v)
+        initial = episode.initial + torch.einsum("k,kvc->vc", values, modes.x)
+        return replace(episode, initial=initial, initial_velocity=velocity)
 
     def _tangents(self, raw: Tensor, i: int, by_fabric: bool = True) -> tuple[Frames, Frames]:
         """One episode, and its derivatives by all unknowns; those by the fabric's are zero if not ``by_fabric``."""
-        placed_modes, episode = self._initial_shape_modes(i), self._initial_episode(raw, i)
-        modes = torch.cat([m for _, m in placed_modes]) if placed_modes else None
+        (mode_columns, modes), episode = self._first_state_modes(i), self._initial_episode(raw, i)
         fabric = raw[: len(self.unknowns)]
         frames, computed = simulate_with_tangents(self.cloth, self.unknowns, fabric, episode, self.dt, modes, by_fabric)
-        mode_columns = [k for index, _ in placed_modes for k in range(index.start, index.stop)]
         columns = torch.tensor([*range(len(self.unknowns) if by_fabric else 0), *mode_columns])
 
         def spread(d: Tensor) -> Tensor:

@@ -118,7 +118,7 @@ def with_grasp_offsets(objective: Objective) -> tuple[Objective, Tensor]:
     """
     is_fitted = any(nuisance.name == GraspOffset.name for nuisance in objective.nuisances)
     vertex_counts = [len(part.index) for part in objective.cloth.boundaries.values() if isinstance(part, Grasp)]
-    noises = [e.noise_std or 0.0 for e in objective.episodes if e.needs_settling]
+    noises = [e.noise_std or 0.0 for e in objective.episodes if e.is_first_shape_measured]
     if is_fitted or not vertex_counts or not noises:
         return objective, torch.zeros(len(objective.start), dtype=torch.bool)
     offset = GraspOffset(math.hypot(CONSIDERED_GRIP_STD_M, max(noises) / min(vertex_counts) ** 0.5))
