@@ -39,6 +39,18 @@ class LinearityCriteria:
 LINEARITY_CRITERIA = LinearityCriteria()
 
 
+class FailedTangents(NamedTuple):
+    """Tangents that do not hold over a finite step.
+
+    Attributes:
+        jacobian: [R, K] of the fabric's K unknowns.
+        steps: [K] finite steps.
+    """
+
+    jacobian: Tensor
+    steps: Tensor
+
+
 class LinearityCheck(NamedTuple):
     """A solution whose derivatives hold, or have been replaced.
 
@@ -49,6 +61,7 @@ class LinearityCheck(NamedTuple):
         curved_parameters: names of unknowns whose interval may be skew.
         failure_reason: why tangents are of no use here. Empty where they are.
         covariance: [K, K] of the estimate, where it does not follow from the tangents.
+        failed_tangents: the tangents that failed. None where they hold.
     """
 
     final: levenberg_marquardt.Iterate
@@ -57,6 +70,7 @@ class LinearityCheck(NamedTuple):
     curved_parameters: list[str]
     failure_reason: str = ""
     covariance: Tensor | None = None
+    failed_tangents: FailedTangents | None = None
 
     @property
     def is_withdrawn(self) -> bool:
@@ -81,10 +95,8 @@ def check_linearity(
     secants, influence = objective.linearise_by_differences(final.raw, steps)
     weight = final.row_weights()[0].sqrt()[:, None]
     secant, tangent = (weight * j[:, : len(steps)] for j in (secants.jacobian, final.linear.jacobian))
-    error = (secant - tangent).norm(dim=0) / secant.norm(dim=0).clamp(min=1e-12)
-    is_noticeable = ~(torch.maximum(secant.norm(dim=0), tangent.norm(dim=0)) * steps < criteria.min_noticeable_stds)
-    error = torch.where(error.isfinite(), error, torch.inf)  # slopes that overflow say nothing
-    error = torch.where(is_noticeable, error, 0.0)
+    squares = torch.stack([slopes.square().sum(0) for slopes in (secant, tangent, secant - tangent)])
+    error = relative_error(squares, steps, criteria)
     if float(error.max()) < criteria.max_relative_error:
         over_one_std = error * deviation[: len(steps)] / steps
         pairs = zip(objective.unknowns, over_one_std, strict=True)
@@ -97,7 +109,24 @@ def check_linearity(
         f"by up to {min(1000.0, 100 * float(error.max())):.0f} %)"
     )
     warning = f"{reason}: no parameter counts as identified"
-    return LinearityCheck(final._replace(linear=secants), influence, [warning], [], reason)
+    tangents = FailedTangents(final.linear.jacobian[:, : len(steps)], steps)
+    return LinearityCheck(final._replace(linear=secants), influence, [warning], [], reason, None, tangents)
+
+
+def relative_error(squares: Tensor, steps: Tensor, criteria: LinearityCriteria = LINEARITY_CRITERIA) -> Tensor:
+    """Compute the relative errors [..., K] of tangents; zero where nobody would notice.
+
+    Args:
+        squares: [3, ..., K] sums of squares of the slopes over finite steps, of the tangents, and of their differences,
+            in rows of unit variance.
+        steps: [K].
+        criteria: what is noticeable.
+    """
+    secant, tangent, difference = squares
+    error = difference.sqrt() / secant.sqrt().clamp(min=1e-12)
+    is_noticeable = ~(torch.maximum(secant, tangent).sqrt() * steps < criteria.min_noticeable_stds)
+    error = torch.where(error.isfinite(), error, torch.inf)  # slopes that overflow say nothing
+    return torch.where(is_noticeable, error, 0.0)
 
 
 def has_runaway_tangents(

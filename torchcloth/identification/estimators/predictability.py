@@ -3,7 +3,8 @@
 Light cloth that buckles forgets small differences. Its tangents grow some tenfold in a third of a second, for ever,
 while the ripples that differ stay millimetres high. Before that, the motion is as regular as any other, and the data
 contain as much information as the tangents say. Where the whole motion fails the test of ``linearity``, this module
-seeks the longest beginning that passes it.
+seeks the longest beginning that passes it. The test itself shows up to which frame its derivatives held, so that
+beginning is tried first.
 """
 
 from __future__ import annotations
@@ -12,11 +13,12 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import NamedTuple
 
+import torch
 from torch import Tensor
 
 from ...errors import SimulationDiverged, UnstableStep
 from . import levenberg_marquardt
-from .linearity import LinearityCheck, check_linearity, has_runaway_tangents
+from .linearity import LinearityCheck, check_linearity, has_runaway_tangents, relative_error
 from .objective import Objective
 
 
@@ -30,6 +32,8 @@ class PredictabilitySettings:
         max_iterations: steps of each search.
         growing_tolerance: standard errors of a step that ends a search while the beginning grows.
         final_tolerance: standard errors of a step that ends the search on the longest beginning.
+        max_relative_error: relative error of the tangents up to which the first beginning reaches. A beginning leaves
+            wider errors than all frames do, over which its own tangents must hold.
     """
 
     fractions: tuple[float, ...] = (0.1, 0.15, 0.22, 0.33, 0.5, 0.75)
@@ -37,6 +41,7 @@ class PredictabilitySettings:
     max_iterations: int = 20
     growing_tolerance: float = 1.0
     final_tolerance: float = 0.1
+    max_relative_error: float = 0.25
 
 
 PREDICTABILITY_SETTINGS = PredictabilitySettings()
@@ -68,8 +73,8 @@ def fit_predictable_part(
 ) -> PredictableFit | None:
     """Fit the longest beginning of the motion that can be predicted.
 
-    The beginning grows, and each search starts from the solution before. From a wrong start the later ripples are
-    wrong as well, and lead nowhere.
+    The first one is as long as the derivatives of all frames held. Where that fails, the beginning grows, and each
+    search starts from the solution before. From a wrong start the later ripples are wrong as well, and lead nowhere.
 
     Args:
         objective: of all frames.
@@ -83,7 +88,13 @@ def fit_predictable_part(
     """
     near, exact = settings.growing_tolerance, settings.final_tolerance
     best, high = None, 1.0
-    for fraction in settings.fractions:
+    longest = find_predictable_fraction(objective, failed, settings.max_relative_error)
+    if longest > settings.fractions[0]:
+        direct = _solve_part(objective, longest, start, on_iterate, exact, settings)
+        if direct is not None:
+            return _describe(objective, failed, *direct)
+        high = longest
+    for fraction in [f for f in settings.fractions if f < high]:
         begin = start if best is None else best[1].final.raw
         result = _solve_part(objective, fraction, begin, on_iterate, near, settings)
         if result is not None:
@@ -100,6 +111,43 @@ def fit_predictable_part(
     part, checked = best
     exact_result = _solve_part(objective, low, checked.final.raw, on_iterate, exact, settings)
     part, checked = exact_result or (part, checked._replace(final=checked.final._replace(converged=False)))
+    return _describe(objective, failed, part, checked)
+
+
+def find_predictable_fraction(objective: Objective, failed: LinearityCheck, max_relative_error: float) -> float:
+    """Return the fraction of the frames before the derivatives of all frames failed; 0 where that is not known.
+
+    Args:
+        objective: of all frames.
+        failed: the check that all frames failed.
+        max_relative_error: of the tangents over a finite step, of all rows up to a frame.
+    """
+    if failed.failed_tangents is None:
+        return 0.0
+    tangent, steps = failed.failed_tangents
+    frame, count = frames_within_episodes(objective, failed.final.linear)
+    fraction, order = ((frame + 1) / count).sort(stable=True)
+    weight = failed.final.row_weights()[0][order, None]
+    secant, tangent = failed.final.linear.jacobian[order, : len(steps)], tangent[order]
+    squares = torch.stack([secant, tangent, secant - tangent]).square()
+    is_last = torch.cat([fraction[1:] > fraction[:-1], torch.ones(1, dtype=torch.bool)])  # row of its frame
+    holds = (relative_error((weight * squares).cumsum(1), steps)[is_last] < max_relative_error).all(1)
+    fails = (~holds).nonzero()
+    first = int(fails[0]) if len(fails) else len(holds)
+    return float(fraction[is_last][first - 1]) if first else 0.0
+
+
+def frames_within_episodes(objective: Objective, linear: levenberg_marquardt.Linearised) -> tuple[Tensor, Tensor]:
+    """Return the number [R] of each row's frame within its episode, and [R] of the frames that it has."""
+    episode = objective.episode_of_rows(linear)
+    gap = levenberg_marquardt.DEFAULT_NOISE_MODEL.frames_per_time_block
+    length = torch.tensor([len(e.times) + gap for e in objective.episodes])
+    observed = torch.tensor([e.observed_count for e in objective.episodes])
+    return linear.frame - (length.cumsum(0) - length)[episode], observed[episode]
+
+
+def _describe(objective: Objective, failed: LinearityCheck, part: Objective, checked: LinearityCheck) -> PredictableFit:
+    """Return a fit of a beginning, with a warning that says how long that is."""
     frames, count = (max(e.observed_count for e in o.episodes) for o in (part, objective))
     duration = max(float(e.times[e.observed_count - 1] - e.times[0]) for e in part.episodes)
     warning = (

@@ -26,6 +26,7 @@ NEAR_OPTIMUM_NOTE = (
     "its end is near enough to the optimum to count: the slopes there lead at most one standard error farther, and the "
     "standard errors include that step"
 )
+HOPED_STD_RATIO = 2.0  # by which standard errors may yet fall in more rounds of simulations around a solution
 SAMPLED_FIT_NOTE = "simulations around the solution know what is near, not what is best"
 UNFINISHED_REMEDY = (
     "more iterations of Gauss-Newton, a nearer start or several, or fewer parameters at once may get there"
@@ -127,10 +128,18 @@ class Search:
         def on_round(raw: Tensor) -> bool:
             return self.append_history(raw, full)
 
-        sampled = statistical_linearisation.fit_by_sampling(full, failed, beginning, iterations, on_round, self.strata)
+        sampled = statistical_linearisation.fit_by_sampling(
+            full, failed, beginning, iterations, on_round, self.strata, self._could_identify
+        )
         if sampled is None:
             return (full, failed) if beginning is None else (beginning.objective, beginning.checked)
         return full, sampled
+
+    def _could_identify(self, raw: Tensor, covariance: Tensor) -> bool:
+        """Whether with smaller standard errors any parameter would be identified that was not measured."""
+        unknowns, hoped = self.objective.unknowns, covariance / HOPED_STD_RATIO**2
+        estimates = make_estimates(self.objective.cloth, unknowns, raw, hoped).parameters
+        return any(estimates[u.name].identifiable for u in unknowns if not u.measured)
 
     def _undecided_parameters(self, objective: Objective, checked: linearity.LinearityCheck) -> list[str]:
         """Names of fitted parameters that a solution does not identify."""
