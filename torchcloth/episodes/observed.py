@@ -122,10 +122,10 @@ class Episode:
                 "or markers and were left out: leave points and markers out of the recording to use forces alone"
             )
         if self.motion and not any(bool(m.closed.any()) for m in self.motion.values()):
-            warnings.append(f"{self.name}: no gripper is ever closed: the cloth was simulated as let go")
+            warnings.append(f"{self.name}: no gripper is ever closed: a simulation lets the cloth go")
         if self.idle_grippers:
             names = ", ".join(self.idle_grippers)
-            warnings.append(f"{self.name}: no grasp is called {names}: the cloth was simulated as not held by it")
+            warnings.append(f"{self.name}: no grasp is called {names}: no simulation holds the cloth there")
         if self._is_far_from_first_cloud():
             offset = (self.clouds[0].mean(0) - self.initial.mean(0)).tolist()
             text = ", ".join(f"{1e3 * x:+.0f}" for x in offset)
