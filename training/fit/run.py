@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import logging
 import os
 import time
-import warnings
 from dataclasses import asdict, replace
 from importlib.util import find_spec
 from pathlib import Path
@@ -24,6 +22,7 @@ from torchcloth._utils.resume import digest, source_fingerprint
 from torchcloth.errors import InvalidInput, MissingDependency
 from torchcloth.identification.estimators.objective import Objective
 
+from ..lightning_output import quieten_lightning
 from . import result
 from .checkpoints import AtomicCheckpointIO, read_checkpoint
 from .cloth_description import build_described_cloth, default_precision, describe_cloth
@@ -32,14 +31,6 @@ from .data import Episodes, read_episodes
 from .learned_cloth import import_network
 from .module import FitModule
 from .progress import ProgressPrinter
-
-IGNORED_WARNINGS = (
-    "does not have many workers",
-    "irectory .* exists and is not empty",
-    "treespec, LeafSpec",
-    "Total length of `list`",
-    "overridden `transfer_batch_to_device`",
-)
 
 
 def fit(config: Config, resume: bool = False) -> FitModule:
@@ -140,9 +131,7 @@ def _check_processes(run: Run) -> None:
 
 
 def _trainer(config: Config, folder: Path, outdated: list[Path]) -> pl.Trainer:
-    for message in IGNORED_WARNINGS:
-        warnings.filterwarnings("ignore", f".*{message}")
-    logging.getLogger("lightning.pytorch").setLevel(logging.WARNING)
+    quieten_lightning()
     world = config.run.processes * config.run.nodes
     return pl.Trainer(
         accelerator="cpu",
