@@ -15,6 +15,7 @@ from .._utils.durations import IterationTimer
 from .._utils.files import PROGRESS_FOLDER_NAME
 from ..errors import InvalidInput
 from . import identify_fields
+from .first_shape_option import add_network_option, estimate_first_shapes
 from .output_paths import (
     check_output_folder,
     check_outside_episodes,
@@ -135,6 +136,7 @@ def _add_options(parser: argparse.ArgumentParser) -> None:
         "--profile", nargs="+", default=[], metavar="NAME", help="find the interval by profile likelihood"
     )
     add_checks_option(parser)
+    add_network_option(parser)
     parser.add_argument(
         "--refine",
         action=argparse.BooleanOptionalAction,
@@ -167,6 +169,9 @@ def _identify(options: argparse.Namespace) -> int:
     cloth, notes = _cloth(options, merge_scene(episodes))
     for note in notes:
         print(f"note: {note}")
+    episodes, shape_std = estimate_first_shapes(options, cloth, episodes)
+    if shape_std is not None and "shape" not in parse_nuisances(options.nuisance):
+        options.nuisance.append(f"shape={shape_std}")
     size = f"{len(episodes)} episode(s), {len(cloth.mesh.faces)} triangles"
     seconds, step = sum(float(e.points.t[-1] - e.points.t[0]) for e in episodes if e.points), cloth.stable_step()
     substeps_text = f", {seconds / step:.2g} in all frames" if seconds else ""

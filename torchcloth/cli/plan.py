@@ -10,6 +10,7 @@ from .._utils.durations import IterationTimer
 from .._utils.files import PROGRESS_FOLDER_NAME
 from ..errors import InvalidInput
 from .diagnose import show_progress_line
+from .first_shape_option import add_network_option, estimate_first_shapes
 from .output_paths import check_output_folder, check_outside_episodes, output_path, replacement_note, resume_hint
 
 if TYPE_CHECKING:
@@ -91,6 +92,7 @@ def add(verbs: Any) -> None:
         metavar="M",
         help="smallest distance between the arms, and between arms and table [m] (default: 0.02)",
     )
+    add_network_option(parser)
     option("--dt", type=float, metavar="SECONDS", help="largest substep (default: the stable one)")
     option("--resume", action="store_true", help="resume a plan that was stopped")
     option(
@@ -108,6 +110,7 @@ def _plan(options: argparse.Namespace) -> int:
 
     from .. import planning, recordings, viewing
     from .._utils.resume import clear_store
+    from ..identification import build_cloth
     from ..planning.result import PLAN_FILE, PLANNED_EPISODE_FOLDER, check_result_folder
     from ..robots import DEFAULT_JOINT_ACCELERATION  # pyright: ignore[reportMissingImports] - mapped from robots/ at installation
 
@@ -118,6 +121,7 @@ def _plan(options: argparse.Namespace) -> int:
     check_output_folder(options.out)
     check_result_folder(options.out)
     recording, goal = recordings.read(options.episode), planning.read_goal(options.goal, options.correspondences)
+    (recording,), _ = estimate_first_shapes(options, build_cloth(recording), [recording])
     models, timer = _models(options, recording), IterationTimer(options.iterations)
     with show_progress_line() as progress:
         result = planning.plan(

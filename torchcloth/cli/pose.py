@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ..errors import InvalidInput
+from .first_shape_option import add_network_option, read_network
 from .identify import describe_causes_outside_cloth, parse_assignments, parse_nuisances
 from .output_paths import check_output_folder, check_outside_episodes, output_path, print_line, replacement_note
 from .recording_checks import add_checks_option
@@ -61,6 +62,7 @@ def add(verbs: Any) -> None:
     )
     pose.add_argument("--dt", type=float, metavar="SECONDS", help="largest substep (default: the stable one)")
     add_checks_option(pose)
+    add_network_option(pose)
     pose.add_argument("--truth", action="store_true", help="show the true cloth of a synthetic episode in the picture")
     pose.add_argument(
         "--out", type=output_path, required=True, metavar="DIR", help="folder for the result and the picture"
@@ -161,4 +163,5 @@ def _estimate(
             dt=options.dt,
             on_progress=advance,
             checks=options.checks,
+            start=read_network(options) or "recording",
         )

@@ -6,7 +6,7 @@ import math
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
-from typing import Any, cast
+from typing import Any, Literal, cast
 
 import numpy as np
 import torch
@@ -33,7 +33,9 @@ from ..recordings import Recording
 from ..recordings.consistency import check_recording
 from ..recordings.size_checks import check_size
 from .fine_scale_uncertainty import estimate_fine_scale_std
+from .first_shape import estimate_first_shape
 from .modes import Modes, check_mode_count, compute_modes
+from .network import PoseEstimator
 from .objective import CorrectedObjective, CorrectiveForce, add_correction_effect, split_into_windows
 from .result import PoseEstimate
 from .smoothing import SmoothedPose, smooth
@@ -61,6 +63,7 @@ def estimate_pose(
     dt: float | None = None,
     on_progress: Progress | None = None,
     checks: bool = True,
+    start: Literal["recording", "network"] | PoseEstimator = "recording",
 ) -> PoseEstimate:
     """Estimate where every vertex of a cloth was at every frame of a recording, hidden ones included.
 
@@ -86,12 +89,15 @@ def estimate_pose(
         on_progress: called with (stage, corrective force so far as a fraction of the weight).
         checks: look for frozen clouds and for a clock that is off, as ``identify`` does (``inspection.corrections``).
             The result has no frames where clouds were frozen. A clock that is off is corrected, and becomes a nuisance.
+        start: where the first shape comes from: the recording; the shipped network (`estimate_first_shape`), which also
+            tells how fast the cloth moves; or a network of one's own. A network's shape is a start: the nuisance
+            "shape" is added with its error.
 
     Returns:
         Frames with standard errors, visibility, forces, warnings.
 
     Raises:
-        InvalidInput: options out of range, or a cloth that has an effect "correction" already.
+        InvalidInput: options out of range, an unknown start, or a cloth that has an effect "correction" already.
         RecordingError: a recording without motion, or without data.
         SimulationDiverged: the cloth cannot be simulated with these values.
     """
@@ -105,6 +111,9 @@ def estimate_pose(
     if checks:
         (recording,), notes, clock_std = check_all([recording])
         nuisances = nuisances if clock_std is None else {"clock": clock_std, **nuisances}
+    if start != "recording":
+        shape = estimate_first_shape(cloth, recording, _network_of(start))
+        recording, nuisances = shape.apply(recording), {"shape": shape.std_rms, **nuisances}
     check_mode_count(cloth.mesh, modes)
     episode, all_modes = build_episode(cloth, recording), compute_modes(cloth.mesh)
     fields = all_modes.fields[:modes].to(episode.initial)
@@ -130,6 +139,13 @@ def estimate_pose(
 
     estimate = _assemble_result(objective, smooth(objective, report), all_modes, gravity, began)
     return replace(estimate, warnings=[*notes, *estimate.warnings])
+
+
+def _network_of(start: str | PoseEstimator) -> PoseEstimator | None:
+    """The network of a start; None: the shipped one."""
+    if isinstance(start, str) and start != "network":
+        raise InvalidInput("start", got=repr(start), expected="'recording', 'network' or a PoseEstimator")
+    return None if isinstance(start, str) else start
 
 
 def _assemble_result(

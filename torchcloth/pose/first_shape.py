@@ -8,6 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 
+import numpy as np
 import torch
 from safetensors import safe_open
 from safetensors.torch import save_file
@@ -31,6 +32,7 @@ NETWORK_FORMAT = "torchcloth-pose-network-1"
 POINTS_SEEN = 256  # of a cloud, as in training
 CLOUD_PERIOD_S = 1 / 30  # between a cloud and the one before, as in training
 VELOCITY_STEP_S = 0.01  # of the difference that gives a gripper's velocity
+SINGLE_CLOUD_PERIOD_S = 1e-3
 SIMULATED_FRAMES = 6  # with which hypotheses are compared
 MAX_NETWORK_BYTES = 50_000_000
 
@@ -41,16 +43,27 @@ class FirstShape(NamedTuple):
     Attributes:
         x: [V, 3] m, of the hypothesis that predicts the next clouds best.
         std: [V] m, standard deviation of a coordinate.
-        v: [V, 3] m/s.
+        v: [V, 3] m/s; None: from a single cloud, of which the cloth is taken to be at rest.
         distances: [S] m, mean distance of the next clouds from the simulation of each hypothesis; NaN: it diverged.
         weights: [S], what the network gave each hypothesis.
     """
 
     x: Tensor
     std: Tensor
-    v: Tensor
+    v: Tensor | None
     distances: Tensor
     weights: Tensor
+
+    @property
+    def std_rms(self) -> float:
+        """Root mean square over vertices of the standard deviation [m]: of the nuisance "shape"."""
+        return float(self.std.square().mean().sqrt())
+
+    def apply(self, recording: Recording) -> Recording:
+        """Return the recording with this first shape and its velocities, for any estimate, fit or plan."""
+        v = None if self.v is None else self.v.double().numpy()
+        info = replace(recording.cloth, initial_vertices=self.x.double().numpy(), initial_velocities=v)
+        return replace(recording, cloth=info)
 
 
 # -- weights ----------------------------------------------------------------------------------------------------------
@@ -180,18 +193,35 @@ def estimate_first_shape(
         RecordingError: no cloud at the first frame.
     """
     network = network or load_network()
-    bare = replace(recording, cloth=replace(recording.cloth, initial_vertices=None))
-    episode, rest = build_episode(cloth, bare), recorded_rest_coordinates(cloth, recording)
+    bare = replace(recording, cloth=replace(recording.cloth, initial_vertices=None, initial_velocities=None))
+    is_single = recording.points is not None and len(recording.points) == 1
+    episode = build_episode(cloth, _with_second_cloud(bare) if is_single else bare)
+    rest = recorded_rest_coordinates(cloth, recording)
     with torch.no_grad():
         first = network(pose_inputs(cloth, episode, 0, rest), samples)
+        hypotheses, std, weights = first.hypotheses[0], first.hypothesis_std[0], first.weights[0]
+        if is_single:
+            return FirstShape(hypotheses[0], std[0], None, _distances_now(cloth, episode, hypotheses), weights)
         velocities = _velocities(network, cloth, episode, rest, first)
         distances = torch.stack(
-            [_distance_ahead(cloth, episode, x, v) for x, v in zip(first.hypotheses[0], velocities, strict=True)]
+            [_distance_ahead(cloth, episode, x, v) for x, v in zip(hypotheses, velocities, strict=True)]
         )
     best = int(distances.nan_to_num(torch.inf).argmin())
-    return FirstShape(
-        first.hypotheses[0, best], first.hypothesis_std[0, best], velocities[best], distances, first.weights[0]
-    )
+    return FirstShape(hypotheses[best], std[best], velocities[best], distances, weights)
+
+
+def _with_second_cloud(recording: Recording) -> Recording:
+    """The recording with its only cloud once more, as an episode needs two; the second one is not looked at."""
+    points = recording.require("points")
+    times = np.array([points.t[0], points.t[0] + SINGLE_CLOUD_PERIOD_S])
+    twice = replace(points, t=times, xyz=np.tile(points.xyz, (2, 1)), counts=np.tile(points.counts, 2))
+    return replace(recording, points=twice)
+
+
+def _distances_now(cloth: Cloth, episode: Episode, hypotheses: Tensor) -> Tensor:
+    """Mean distance [S] m of the first cloud from each hypothesis."""
+    cloud, faces = episode.clouds[0].float(), torch.as_tensor(cloth.mesh.faces)
+    return torch.stack([chamfer_to_surface(cloud, x, faces) for x in hypotheses])
 
 
 def _velocities(
@@ -219,8 +249,3 @@ def _distance_ahead(cloth: Cloth, episode: Episode, x: Tensor, v: Tensor) -> Ten
         if len(cloud)
     ]
     return torch.stack(distances).mean()
-
-
-def with_first_shape(recording: Recording, x: Tensor) -> Recording:
-    """Return the recording with a first shape [V, 3] m, of its own vertices."""
-    return replace(recording, cloth=replace(recording.cloth, initial_vertices=x.double().numpy()))
