@@ -430,6 +430,26 @@ def test_an_initial_grid_in_another_order(episode):
     refused(episode, "is not a shape of this mesh; got edges up to")
 
 
+@pytest.mark.parametrize(
+    ("shape", "speed", "message"),
+    [
+        ((5, 3), 1.0, r"v.npy has the wrong shape; got \[5, 3\]; expected \[12, 3\]"),
+        ((12, 3), 300.0, "v.npy is too fast; got 300 m/s; .*millimetres per second"),
+    ],
+)
+def test_velocities_of_another_mesh_or_unit(episode, shape, speed, message):
+    np.save(episode / "v.npy", np.full(shape, speed))
+    edit_json(episode, ("cloth", "initial_velocities"), "v.npy")
+    refused(episode, message)
+
+
+def test_velocities_without_a_first_shape(episode):
+    np.save(episode / "v.npy", np.zeros((12, 3)))
+    edit_json(episode, ("cloth", "initial_velocities"), "v.npy")
+    edit_json(episode, ("cloth", "initial_vertices"), None)
+    refused(episode, "v.npy belongs to no first shape")
+
+
 def test_a_cloth_that_is_stretched_and_measured_with_noise_is_read(episode):
     initial = np.load(episode / "cloth_initial.npy") * [1.5, 1.0, 1.0]
     np.save(episode / "cloth_initial.npy", initial + np.random.default_rng(0).normal(0, 5e-3, initial.shape))

@@ -18,7 +18,7 @@ from PIL import Image
 import torchcloth as tc
 from torchcloth import recordings as rec
 from torchcloth.errors import InvalidInput, RecordingError
-from torchcloth.recordings import atomic_write, writing
+from torchcloth.recordings import atomic_write, formats, writing
 
 FLOAT32 = 1e-7  # relative precision of float32 times the 1 m size of the scene
 HALF_STEP = 0.5e-4 + 1e-12  # points are stored in tenths of a millimetre
@@ -104,6 +104,14 @@ def test_a_sewn_garment_is_an_episode(assert_same, tmp_path):
     np.testing.assert_array_equal(again.rest, mesh.rest)
     np.testing.assert_array_equal(again.seams, mesh.seams)
     np.testing.assert_array_equal(tc.meshes.load(tmp_path / "ep" / "cloth.obj").rest, mesh.rest)
+
+
+@pytest.mark.parametrize(("write", "read"), [(rec.write, rec.read), (formats.write_mcap, formats.read)])
+def test_velocities_of_the_first_frame_are_read_as_they_were_written(recording, tmp_path, write, read):
+    velocities = np.random.default_rng(0).normal(size=recording.cloth.vertices.shape)
+    moving = replace(recording, cloth=replace(recording.cloth, initial_velocities=velocities))
+    back = read(write(moving, tmp_path / "ep.mcap"))
+    np.testing.assert_array_equal(back.cloth.initial_velocities, velocities)
 
 
 def test_the_format_texts_example_is_read(tmp_path):

@@ -22,6 +22,7 @@ MAX_THICKNESS_M = 0.05
 DEFAULT_THICKNESS_M = 1e-3  # if the episode gives none
 DEFAULT_TABLE_FRICTION = 0.4  # if the episode gives none
 MAX_GRASP_RADIUS_M = 1.0
+MAX_INITIAL_SPEED_M_PER_S = 50.0
 MAX_DEPTH_SCALE_M = 0.1  # per unit of a depth image
 NOMINAL_BOUNDS: dict[str, dict[str, Any]] = {  # bounds; far above every fabric, where a number is in another unit
     "membrane_stiffness": {"above": 0, "maximum": 1e9, "suspect": "another unit"},
@@ -38,6 +39,7 @@ DISTORTION_COUNTS = (0, 4, 5, 8, 12, 14)  # coefficients in OpenCV's order: a ca
 def read_cloth(fields: Fields, folder: Folder) -> ClothInfo:
     """Read the cloth; it needs a mesh or a sheet, and if both are given they must agree."""
     mesh, start = fields.optional(fields.text, "mesh"), fields.optional(fields.text, "initial_vertices")
+    velocities = fields.optional(fields.text, "initial_velocities")
     sheet = fields.group("sheet")
     if mesh is None and not sheet.remaining:
         raise RecordingError(
@@ -51,6 +53,7 @@ def read_cloth(fields: Fields, folder: Folder) -> ClothInfo:
         faces=faces,
         uv=uv,
         initial_vertices=None if start is None else _initial(folder, start, vertices),
+        initial_velocities=None if velocities is None else _velocities(folder, velocities, start, vertices),
         extra=fields.unknown_keys(sheet=sheet),
     )
     check_initial_shape(cloth, folder.location(start or ""))
@@ -184,6 +187,26 @@ def _initial(folder: Folder, file: str, vertices: np.ndarray | None) -> np.ndarr
         )
     checks.check_metres(initial, place)
     return initial
+
+
+def _velocities(folder: Folder, file: str, start: str | None, vertices: np.ndarray | None) -> np.ndarray:
+    place = folder.location(file)
+    if start is None or vertices is None:
+        raise RecordingError(
+            f"{place} belongs to no first shape",
+            expected="cloth.mesh and cloth.initial_vertices in episode.json",
+            remedy="write both too, or leave the velocities out",
+        )
+    velocities = checks.check_array(folder.read_npy(file), place, (len(vertices), 3))
+    fastest = float(np.abs(velocities).max(initial=0.0))
+    if not fastest <= MAX_INITIAL_SPEED_M_PER_S:
+        raise RecordingError(
+            f"{place} is too fast",
+            got=f"{fastest:g} m/s",
+            expected=f"at most {MAX_INITIAL_SPEED_M_PER_S:g} m/s",
+            remedy="are these millimetres per second?",
+        )
+    return velocities
 
 
 def _nominal(fields: Fields) -> dict[str, Any]:

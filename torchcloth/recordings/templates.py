@@ -10,7 +10,9 @@ from .reading import read
 from .robot_files import ROBOTS_FOLDER
 from .types import Recording
 
-TEMPLATE_FILES = frozenset(("episode.json", "motion.npz", "cloth.obj", "cloth_initial.npy", ROBOTS_FOLDER))
+TEMPLATE_FILES = frozenset(
+    ("episode.json", "motion.npz", "cloth.obj", "cloth_initial.npy", "cloth_velocities.npy", ROBOTS_FOLDER)
+)
 
 
 def as_template(recording: Recording, provenance: str) -> Recording:

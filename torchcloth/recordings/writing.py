@@ -20,7 +20,7 @@ from .reading import EPISODE_FILE, EPISODE_FORMAT, EPISODE_SCHEMA, EPISODE_VERSI
 from .robot_files import copy_robot_files
 from .types import Camera, ClothInfo, GraspInfo, Recording
 
-MESH_FILE, INITIAL_VERTICES_FILE = "cloth.obj", "cloth_initial.npy"
+MESH_FILE, INITIAL_VERTICES_FILE, INITIAL_VELOCITIES_FILE = "cloth.obj", "cloth_initial.npy", "cloth_velocities.npy"
 POINT_SCALE_M = 1e-4  # resolution of compact points; far below any sensor's noise
 
 
@@ -109,6 +109,7 @@ def _cloth(cloth: ClothInfo) -> dict[str, Any]:
         "mesh": None if cloth.vertices is None else MESH_FILE,
         "sheet": None if cloth.sheet is None else {"width": cloth.sheet[0], "height": cloth.sheet[1]},
         "initial_vertices": None if cloth.initial_vertices is None else INITIAL_VERTICES_FILE,
+        "initial_velocities": None if cloth.initial_velocities is None else INITIAL_VELOCITIES_FILE,
     }
     plain = ("areal_density", "areal_density_std", "thickness", "nominal")
     return _with(cloth.extra, **known, **{key: getattr(cloth, key) for key in plain})
@@ -123,8 +124,14 @@ def _write_cloth(part: Path, cloth: ClothInfo) -> None:
         if cloth.faces is None:
             raise RecordingError("cloth.faces is missing", expected="[F, 3] beside cloth.vertices")
         (part / MESH_FILE).write_text(obj.dump(cloth.vertices, cloth.faces, cloth.uv), encoding="utf-8")
-    if cloth.initial_vertices is not None:
-        np.save(part / INITIAL_VERTICES_FILE, cloth.initial_vertices, allow_pickle=False)
+    for file, array in initial_state_files(cloth).items():
+        np.save(part / file, array, allow_pickle=False)
+
+
+def initial_state_files(cloth: ClothInfo) -> dict[str, np.ndarray]:
+    """Return the arrays of the first frame by the name of their file."""
+    arrays = {INITIAL_VERTICES_FILE: cloth.initial_vertices, INITIAL_VELOCITIES_FILE: cloth.initial_velocities}
+    return {file: array for file, array in arrays.items() if array is not None}
 
 
 def build_motion_arrays(recording: Recording) -> dict[str, Any]:

@@ -177,7 +177,7 @@ def make_episode(experiment: Experiment, template: Recording) -> Recording:
         path = centre + offset + np.einsum("kab,kb->ka", spin, arm + 0.5 * apart[:, None] * outward)
         grippers[name] = _make_gripper(t, path, spin @ turn @ rotation, template, name)
     moved_shape = (shape - centre) @ turn.T + centre
-    placed = replace(template, cloth=replace(template.cloth, initial_vertices=moved_shape))
+    placed = replace(template, cloth=replace(template.cloth, initial_vertices=moved_shape, initial_velocities=None))
     arms = {name: robot for name, robot in template.robots.items() if name in grippers}
     return replace(
         placed,

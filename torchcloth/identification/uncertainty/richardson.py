@@ -73,15 +73,25 @@ def refine_cloth(cloth: Cloth) -> Cloth:
 
 def refine_recording(recording: Recording, coarse: Mesh, fine: Mesh) -> Recording:
     """Return the episode for the fine mesh of ``refine_cloth``, whose first shape includes the new vertices."""
-    first = recording.cloth.initial_vertices
-    if first is not None and first.ndim == 2:  # else it is a sheet's grid
-        vertices = transfer_vertices(coarse, recording, torch.as_tensor(first)).numpy()
-        first = _add_midpoints(vertices, _divide_faces(coarse.faces)[0])
-        if fine.uv is not None:
-            weights = interpolation_weights(_divide_mesh(coarse), fine.uv)
-            first = interpolate_on_pattern(weights, torch.as_tensor(first)).numpy()
-    info = replace(recording.cloth, vertices=fine.vertices, faces=fine.faces, uv=fine.uv, initial_vertices=first)
+    info = recording.cloth
+    refined = {
+        name: _refine_vertices(recording, coarse, fine, values)
+        for name in ("initial_vertices", "initial_velocities")
+        if (values := getattr(info, name)) is not None and values.ndim == 2  # else it is a sheet's grid
+    }
+    info = replace(info, vertices=fine.vertices, faces=fine.faces, uv=fine.uv, **refined)
     return replace(recording, cloth=info)
+
+
+def _refine_vertices(recording: Recording, coarse: Mesh, fine: Mesh, values: np.ndarray) -> np.ndarray:
+    """Return values of the fine mesh's vertices, [V, 3], from those of the episode's own."""
+    values = _add_midpoints(
+        transfer_vertices(coarse, recording, torch.as_tensor(values)).numpy(), _divide_faces(coarse.faces)[0]
+    )
+    if fine.uv is None:
+        return values
+    weights = interpolation_weights(_divide_mesh(coarse), fine.uv)
+    return interpolate_on_pattern(weights, torch.as_tensor(values)).numpy()
 
 
 def mesh_correction(objective: Objective, final: levenberg_marquardt.Iterate, scene: FineScene) -> Tensor:

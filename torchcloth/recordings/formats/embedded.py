@@ -2,7 +2,7 @@
 
 /torchcloth/scene (std_msgs/String) is episode.json with the mapping of the topics; /torchcloth/files
 (std_msgs/UInt8MultiArray, the label of its first dimension is the name) holds cloth.obj, cloth_initial.npy,
-markers.npz, truth.npz, and extra.npz with the arrays for which no standard message has a place.
+cloth_velocities.npy, markers.npz, truth.npz, and extra.npz with the arrays for which no standard message has a place.
 """
 
 from __future__ import annotations

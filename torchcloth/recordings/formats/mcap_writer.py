@@ -286,10 +286,10 @@ def _files(recording: Recording) -> Iterator[tuple[str, bytes]]:
     cloth = recording.cloth
     if cloth.vertices is not None and cloth.faces is not None:
         yield writing.MESH_FILE, obj.dump(cloth.vertices, cloth.faces, cloth.uv).encode()
-    if cloth.initial_vertices is not None:
+    for name, array in writing.initial_state_files(cloth).items():
         file = io.BytesIO()
-        np.save(file, cloth.initial_vertices, allow_pickle=False)
-        yield writing.INITIAL_VERTICES_FILE, file.getvalue()
+        np.save(file, array, allow_pickle=False)
+        yield name, file.getvalue()
     for name, stream in ((streams.MARKERS_FILE, recording.markers), (streams.TRUTH_FILE, recording.truth)):
         if stream is not None:
             yield name, _npz(writing.bag_fields(stream))
