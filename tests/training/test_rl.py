@@ -1,7 +1,6 @@
 """The environment of ``torchcloth plan``'s scenes, and a learner in it."""
 
-import warnings
-
+import gymnasium
 import numpy as np
 import pytest
 import torch
@@ -14,7 +13,7 @@ from torchcloth.planning.forward_model import ForwardModel, exact_model
 from torchcloth.planning.task import PlanningTask
 from torchcloth.robots import DEFAULT_JOINT_ACCELERATION
 from torchcloth.robots.primitives import GripperLimits
-from torchcloth.training.rl import ReachEnv, learn
+from torchcloth.training.rl import ReachEnv, ReachVectorEnv, learn
 from torchcloth.training.rl.env import StepwiseSpline, make_stepwise
 
 WAIT = 0.1
@@ -47,9 +46,62 @@ def test_a_step_is_done_in_its_own_stretch_of_time():
 def test_it_is_an_environment(scene):
     from gymnasium.utils.env_checker import check_env
 
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # of observations without ends
-        check_env(ReachEnv(task_of(scene())), skip_render_check=True)
+    check_env(ReachEnv(task_of(scene())), skip_render_check=True)
+
+
+def test_the_registered_environment_is_clean():
+    from gymnasium.utils.env_checker import check_env
+
+    env = gymnasium.make("torchcloth/Reach-v0", garment="dress", seed=1)
+    check_env(env.unwrapped, skip_render_check=True)
+
+
+def test_scenes_of_a_batch_move_as_alone():
+    batch = gymnasium.make_vec("torchcloth/Reach-v0", num_envs=3, garment="dress")
+    alone = batch.env
+    actions = np.random.default_rng(0).uniform(-0.5, 0.5, (2, 3, alone.count)).astype(np.float32)
+    observations, _ = batch.reset(seed=0)
+    assert observations.shape == batch.observation_space.shape
+    for k in range(2):
+        observations, rewards, over, _, infos = batch.step(actions[k])
+    assert over.all()
+    assert np.array_equal(observations[0], alone.reset()[0])  # reset in the same step
+    for i in range(2):
+        alone.reset()
+        alone.step(actions[0, i])
+        observation, reward, _, _, _ = alone.step(actions[1, i])
+        assert rewards[i] == pytest.approx(reward, rel=1e-3)
+        assert infos["final_obs"][i] == pytest.approx(observation, abs=0.05)  # chaos of the last digits
+
+
+def test_a_torn_scene_of_a_batch_ends_alone(monkeypatch):
+    tried = []
+    batch = ReachVectorEnv(ReachEnv(task_of(make_hand_episode())), 2, tried.append)
+    whole = batch.env.run.simulate_interval
+
+    def tear(state, motion, begin, end):
+        if any(float(path.pose[..., -1, 0, 3].max()) > limit for path in motion.values()):
+            raise SimulationDiverged("torn")
+        return whole(state, motion, begin, end)
+
+    batch.reset()
+    first = batch.env.task.motion(batch.env.task.start)
+    limit = max(float(path.pose[-1, 0, 3]) for path in first.values()) + 1e-3
+    monkeypatch.setattr(batch.env.run, "simulate_interval", tear)
+    push = np.zeros((2, batch.env.count))
+    push[1, 0] = push[1, batch.env.count // 2] = 1.0
+    _, rewards, over, _, _ = batch.step(push)
+    assert over.tolist() == [False, True]
+    assert rewards[1] < -1 < 0 > rewards[0]
+    assert [t.distance for t in tried] == [np.inf]
+    with pytest.raises(InvalidInput, match="num_envs"):
+        ReachVectorEnv(batch.env, 0)
+
+
+def test_sac_learns_on_a_batch_of_scenes():
+    result = learn(task_of(make_hand_episode()), motions=10, random_motions=4, scenes=4)
+    assert len(result.history) == len(result.seconds) == 11
+    assert result.seconds == sorted(result.seconds)
 
 
 def test_of_an_episode_it_is_what_is_planned_in():

@@ -1,6 +1,7 @@
 """Garments that descent and a learner bring to a goal: the study's parts, and all of it, small."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -10,6 +11,11 @@ from torchcloth.planning.objective import build_objective
 from torchcloth.training.studies import trajectories
 from torchcloth.training.studies.command import main
 from torchcloth.training.studies.trajectories import FAST_SCALE, build_scene, make_hidden_goal, sample_surface
+from torchcloth.training.studies.trajectory_execution import garment_spec
+from torchcloth.training.studies.trajectory_scenes import check_limits, measure_chaos
+from torchcloth.training.studies.trajectory_searches import search_by_cmaes, search_by_gauss_newton
+from torchcloth.training.studies.trajectory_tables import build_summary_table, count_first_wins, retained_fraction
+from torchcloth.training.validation.independent.garment import MujocoGarment
 
 
 def test_points_lie_evenly_on_the_surface():
@@ -29,17 +35,66 @@ def test_the_goal_is_elsewhere_and_can_be_reached():
     assert goal.points.shape == (trajectories.GOAL_POINTS, 3)
 
 
+def test_a_carried_garment_is_brought_to_the_goal_within_all_limits():
+    scene = build_scene("dress", "carry", FAST_SCALE.coarse, FAST_SCALE.waypoints)
+    goal = make_hidden_goal(scene, np.random.default_rng(0))
+    descent = search_by_gauss_newton([scene], goal, 2)
+    by_chance = search_by_cmaes(scene, goal, descent.history[-1].seconds, seed=0)
+    assert descent.history[-1].motions == 3 + 2 * len(descent.best)
+    assert descent.expected < by_chance.expected < descent.history[0].distance
+    for outcome in (descent, by_chance):
+        assert check_limits(outcome.task, outcome.best)[0] == 0
+    assert check_limits(descent.task, 20 * descent.best)[0] > 0
+    assert measure_chaos(scene, scene.recorded_motion, np.random.default_rng(0), 1) < 5e-3
+
+
+def test_the_summary_counts_garments_and_seeds():
+    results = {
+        f"dress-carry-{seed}-{method}": {
+            "garment": "dress",
+            "action": "carry",
+            "seed": seed,
+            "method": method,
+            "recorded": 0.1,
+            "recorded_expected": 0.1,
+            "expected": expected,
+            "executed": 0.02,
+            "mujoco_executed": None,
+            "motions": 10,
+            "seconds": 1.0,
+            "limit_violations": 0,
+        }
+        for seed, method, expected in [(0, "gauss-newton", 0.01), (0, "sac", 0.03), (1, "gauss-newton", 0.02)]
+    }
+    results["dress-carry-1-sac"] = results["dress-carry-0-sac"] | {"seed": 1, "expected": 0.015}
+    assert count_first_wins(results, "sac", "carry") == (1, 2)
+    assert retained_fraction(results["dress-carry-0-gauss-newton"]) == pytest.approx(0.08 / 0.09)
+    assert build_summary_table(results).row_count == 4
+
+
+def test_a_garment_hangs_in_mujoco_as_here():
+    pytest.importorskip("mujoco")
+    scene = build_scene("dress", "carry", FAST_SCALE.coarse, FAST_SCALE.waypoints)
+    spec = replace(garment_spec("dress", scene), gravity=0.0, drag_normal=0.0)
+    still = MujocoGarment(spec).run(spec.rest, np.array([0.0, 0.01]), {})
+    assert np.abs(still.x[-1] - spec.rest).max() < 1e-4
+    assert spec.masses.sum() == pytest.approx(spec.areal_density * spec.areas.sum())
+
+
 @pytest.mark.slow
 def test_all_methods_on_one_garment(tmp_path, capsys):
     assert main(["trajectories", "--fast", "--garments", "dress", "--out", str(tmp_path)]) == 0
     results = json.loads((tmp_path / "trajectories.json").read_text())
     assert results.pop("schema") == "torchcloth.study.trajectories/1"
-    assert set(results) == {f"dress-{method}" for method in trajectories.METHOD_NAMES}
-    for case in results.values():
-        assert case["expected"] == min(d for d in case["history"] if d is not None)
-        assert case["recorded"] == results["dress-sac"]["recorded"]
-    assert results["dress-gauss-newton"]["executed"] < results["dress-gauss-newton"]["recorded"]
-    assert len(results["dress-sac"]["history"]) == FAST_SCALE.sac + 1
+    assert set(results) == {"chaos-dress-carry", *(f"dress-carry-0-{m}" for m in trajectories.METHOD_NAMES)}
+    first = results["dress-carry-0-gauss-newton"]
+    for method in trajectories.METHOD_NAMES:
+        case = results[f"dress-carry-0-{method}"]
+        assert case["recorded"] == first["recorded"]
+        assert case["limit_violations"] == 0
+    assert first["executed"] < 0.3 * first["recorded"]
+    assert first["mujoco_executed"] < 0.3 * first["mujoco_recorded"]
+    assert len(results["dress-carry-0-sac"]["history"]) == FAST_SCALE.sac + 1
     assert (tmp_path / "trajectories.png").stat().st_size > 10_000
     assert "half way after" in capsys.readouterr().out
 

@@ -26,6 +26,7 @@ from torchcloth.planning.task import PlanningTask
 from torchcloth.recordings import Recording
 from torchcloth.robots import DEFAULT_JOINT_ACCELERATION  # pyright: ignore[reportMissingImports] - mapped from robots/
 from torchcloth.robots.primitives import GripperLimits  # pyright: ignore[reportMissingImports]
+from torchcloth.types import ClothState
 
 try:
     import gymnasium
@@ -34,6 +35,7 @@ except ImportError as error:
 
 OBSERVED_VERTICES = 32  # spread over the cloth
 LENGTH_SCALE_M = 0.5  # by which observed positions are divided
+MAX_OBSERVATION = 20.0  # observations are cut there; a garment is never that far away nor that fast
 TORN_PENALTY = 5.0  # cost of an unstable simulation, in units of the recorded motion's distance
 
 
@@ -95,9 +97,10 @@ class ReachEnv(gymnasium.Env):
         self.vertices = _spread_vertices(self.run.state.x, OBSERVED_VERTICES)
         self.middle = task.goal.points.mean(0).to(self.run.state.x)
         self.recorded_distance = max(task.evaluate(task.start)[0], 1e-9)
+        self.first_distance = self.distance(self.run.state.x)
         self.reach = _largest_steps(task)
         size = 6 * len(self.vertices) + self.count + 1
-        self.observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (size,), np.float32)
+        self.observation_space = gymnasium.spaces.Box(-MAX_OBSERVATION, MAX_OBSERVATION, (size,), np.float32)
         self.action_space = gymnasium.spaces.Box(-1.0, 1.0, (self.count,), np.float32)
 
     @classmethod
@@ -132,51 +135,58 @@ class ReachEnv(gymnasium.Env):
         """Reset the cloth to its first shape at rest."""
         super().reset(seed=seed)
         self.at, self.done, self.state = self.task.start.clone(), 0, self.run.state
-        self.away = float(self.task.objectives[0].distance(self.state.x))
-        return self._observation(), {}
+        self.away = self.first_distance
+        return self.observe(self.state, self.at, self.done), {}
 
     def step(self, action: np.ndarray):
         """Simulate one interval of time; the last one includes the wait."""
         k = self.done
-        fraction = torch.as_tensor(np.asarray(action, dtype=np.float64)).clamp(-1.0, 1.0)
-        largest_up, largest_down = (reach[self.interval_unknowns[k]] for reach in self.reach)
-        wanted = fraction * torch.where(fraction > 0, largest_up, largest_down)
-        after = self.at.clone()
-        after[self.interval_unknowns[k]] = self._limit_steps(k, wanted)
-        if self.task.is_clear(after):
-            self.at = after
+        self.at = self.add_step(self.at, k, action)
         self.done += 1
         is_over = self.done == self.intervals
-        end = self.last if is_over else float(self.ends[self.done])
         try:
             with torch.no_grad():
-                self.state = self.run.simulate_interval(self.state, self.task.motion(self.at), float(self.ends[k]), end)
-            distance = self.away = float(self.task.objectives[0].distance(self.state.x))
+                self.state = self.run.simulate_interval(self.state, self.task.motion(self.at), *self.times(k))
+            distance = self.away = self.distance(self.state.x)
             reward = -distance / self.recorded_distance
-        except SimulationDiverged:  # the motion ends; the penalty makes sure that an early end does not pay off
-            distance, is_over = math.inf, True
-            reward = -(self.intervals - k) * max(TORN_PENALTY, self.away / self.recorded_distance)
+        except SimulationDiverged:
+            distance, is_over, reward = math.inf, True, self.torn_reward(k, self.away)
         if is_over:
             self.on_motion(FinishedMotion(distance, self.at))
-        return self._observation(), reward, is_over, False, {"distance": distance}
+        return self.observe(self.state, self.at, self.done), reward, is_over, False, {"distance": distance}
 
-    def _limit_steps(self, k: int, wanted: Tensor) -> Tensor:
-        """Return the steps of interval ``k`` that are nearest to the wanted ones within the limits."""
-        bounds, done = self.task.bounds, self.task.bounds.rows @ self.at
+    def times(self, k: int) -> tuple[float, float]:
+        """Return begin and end [s] of interval ``k``; the last one includes the wait."""
+        return float(self.ends[k]), self.last if k + 1 == self.intervals else float(self.ends[k + 1])
+
+    def distance(self, x: Tensor) -> float:
+        """Return the distance [m] of a cloth [V, 3] m from the goal."""
+        return float(self.task.objectives[0].distance(x))
+
+    def torn_reward(self, k: int, distance: float) -> float:
+        """Return the reward where the simulation becomes unstable in interval ``k``: an early end does not pay off."""
+        return -(self.intervals - k) * max(TORN_PENALTY, distance / self.recorded_distance)
+
+    def add_step(self, at: Tensor, k: int, action: np.ndarray) -> Tensor:
+        """Return the unknowns [N] with the step of interval ``k``, nearest to the wanted one within the limits."""
+        fraction = torch.as_tensor(np.asarray(action, dtype=np.float64)).clamp(-1.0, 1.0)
         interval_unknowns = self.interval_unknowns[k]
+        largest_up, largest_down = (reach[interval_unknowns] for reach in self.reach)
+        wanted = fraction * torch.where(fraction > 0, largest_up, largest_down)
+        bounds, done = self.task.bounds, self.task.bounds.rows @ at
         left = bounds._replace(rows=bounds.rows[:, interval_unknowns], low=bounds.low - done, high=bounds.high - done)
-        return solve_constrained_step(torch.zeros_like(wanted), -wanted, torch.eye(len(wanted)).to(wanted), left)
+        identity = torch.eye(len(wanted)).to(wanted)
+        after = at.clone()
+        after[interval_unknowns] = solve_constrained_step(torch.zeros_like(wanted), -wanted, identity, left)
+        return after if self.task.is_clear(after) else at
 
-    def _observation(self) -> np.ndarray:
-        x, v = self.state.x[self.vertices] - self.middle, self.state.v[self.vertices]
-        steps_so_far = torch.cat([z.sum(0) for z in self.task.split_waypoints(self.at)])
-        parts = [
-            (x / LENGTH_SCALE_M).flatten(),
-            v.flatten(),
-            steps_so_far,
-            steps_so_far.new_tensor([self.done / self.intervals]),
-        ]
-        return torch.cat(parts).numpy().astype(np.float32)
+    def observe(self, state: ClothState, at: Tensor, done: int) -> np.ndarray:
+        """Return the observation [O] after ``done`` intervals."""
+        x, v = state.x[self.vertices] - self.middle, state.v[self.vertices]
+        steps_so_far = torch.cat([z.sum(0) for z in self.task.split_waypoints(at)])
+        fraction = steps_so_far.new_tensor([done / self.intervals])
+        parts = [(x / LENGTH_SCALE_M).flatten(), v.flatten(), steps_so_far, fraction]
+        return torch.cat(parts).clamp(-MAX_OBSERVATION, MAX_OBSERVATION).numpy().astype(np.float32)
 
 
 def _largest_steps(task: PlanningTask) -> tuple[Tensor, Tensor]:
@@ -198,3 +208,24 @@ def _spread_vertices(x: Tensor, count: int) -> Tensor:
         chosen.append(int(distance.argmax()))
         distance = torch.minimum(distance, (x - x[chosen[-1]]).norm(dim=1))
     return torch.tensor(chosen)
+
+
+def make_garment_env(
+    garment: str = "dress", action: str = "carry", triangles: int = 150, waypoints: int = 2, seed: int = 0
+) -> ReachEnv:
+    """Build the environment of a garment in two grippers and a hidden goal, as in the study ``trajectories``.
+
+    Args:
+        garment: "dress", "trousers" or "shirt".
+        action: the motion to begin with: "carry", "drag", "cover" or "fling".
+        triangles: approximate number.
+        waypoints: number of actions.
+        seed: of the hidden goal.
+    """
+    from ..studies.manipulations.scenes import Discretisation
+    from ..studies.trajectory_scenes import build_scene, make_hidden_goal
+
+    scene = build_scene(garment, action, Discretisation(triangles, gap=0.1), waypoints)
+    goal = make_hidden_goal(scene, np.random.default_rng(seed))
+    courses = [make_stepwise(course) for course in scene.courses]
+    return ReachEnv(PlanningTask([scene.run], courses, goal, None, None))

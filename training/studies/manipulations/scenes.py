@@ -26,6 +26,7 @@ from torchcloth.materials import AEP
 from torchcloth.meshes import Mesh
 from torchcloth.robots import primitives  # pyright: ignore[reportMissingImports] - mapped from robots/
 from torchcloth.robots.primitives import Action, GripperLimits  # pyright: ignore[reportMissingImports]
+from torchcloth.robots.primitives.base import Move, build_action  # pyright: ignore[reportMissingImports]
 from torchcloth.synthesis.garments import (
     BENDING_DAMPING_TIME_S,
     DEFAULT_AREAL_DENSITY_KG_PER_M2,
@@ -39,6 +40,8 @@ from torchcloth.synthesis.initial_scene import INITIAL_LAYER_DISTANCE_M, MIN_HAN
 
 STUDY_GARMENTS = ("dress", "trousers", "shirt")
 ACTIONS = ("cover", "fling", "drag")
+CARRY = "carry"  # the garment hangs in the grippers, which carry it along; not part of the fits
+CARRY_SHIFT_M = (0.3, 0.0, 0.1)
 SPEEDS = {"slow": 0.7, "middle": 0.85, "fast": 1.0}  # largest speed of the grippers [m/s]
 GRIPS = {
     "at the corners": (0.0, 0.0),
@@ -58,7 +61,7 @@ class Manipulation:
     Attributes:
         garment: one of ``STUDY_GARMENTS``.
         number: index of the manipulation, and seed of the sensor's errors.
-        action: one of ``ACTIONS``.
+        action: one of ``ACTIONS``, or ``CARRY``.
         speed: key of ``SPEEDS``.
         grip: key of ``GRIPS``.
         posture: key of ``POSTURES``.
@@ -151,7 +154,7 @@ class Scene:
     """
 
     def __init__(self, what: Manipulation, fine: Discretisation) -> None:
-        self.what, self.fine, self.hangs = what, fine, what.action == "fling"
+        self.what, self.fine, self.hangs = what, fine, what.action in ("fling", CARRY)
         self.garment = GARMENTS[what.garment]
         made = build_garment_mesh(self.garment, fine.triangles)
         self.rest, self.length = made.vertices, float(np.ptp(made.vertices[:, 1]))
@@ -202,7 +205,7 @@ class Scene:
         else:
             forward, side, up = self.length / 2 - y, x, z + 1.5 * INITIAL_LAYER_DISTANCE_M
         turn = POSTURES[self.what.posture]
-        near = {"drag": 0.46, "cover": 0.36, "fling": 0.50}[self.what.action]
+        near = {"drag": 0.46, "cover": 0.36, "fling": 0.50, CARRY: 0.50}[self.what.action]
         return np.stack(
             [
                 near + math.cos(turn) * forward - math.sin(turn) * side,
@@ -213,9 +216,12 @@ class Scene:
         )
 
     def _action(self, grips: dict[str, tuple[float, ...]]) -> Action:
-        """Return the action: away from the arms for cover and fling, towards them for drag."""
+        """Return the action: towards the arms for drag, away from them for all others."""
         speed = SPEEDS[self.what.speed] / self.what.slower
         limits = GripperLimits(speed, 8.0 * speed**2)
+        if self.what.action == CARRY:
+            moves = [Move(CARRY_SHIFT_M)]
+            return build_action(grips, moves, heading=0.0, rest=REST_TIME_S, limits=limits, release=False)
         if self.what.action == "fling":
             return primitives.fling(grips, 0.12, heading=0.0, pull=0.15, landing=0.05, rest=REST_TIME_S, limits=limits)
         if self.what.action == "drag":

@@ -1,0 +1,136 @@
+"""A garment in MuJoCo flex: any triangulated surface, hanging in its grippers, without contact."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from torchcloth._utils.constants import STANDARD_AIR_DENSITY_KG_PER_M3, STANDARD_GRAVITY_M_PER_S2
+from torchcloth.errors import InvalidInput
+
+from . import mujoco_cloth
+from .flex_sheet import STEP_SAFETY_FACTOR, StillAir
+from .mujoco_cloth import Grip, MujocoCloth, hold_grips
+
+Array = np.ndarray
+SETTLING_S, SETTLING_DAMPING_PER_S = 1.2, 12.0
+
+
+@dataclass(frozen=True)
+class GarmentSpec:
+    """A triangulated garment and the air around it.
+
+    Attributes:
+        rest: [V, 3] m, vertices of the relaxed garment.
+        faces: [F, 3].
+        areal_density: kg/m^2.
+        membrane_stiffness: N/m, Young's modulus times thickness.
+        poisson_ratio: -.
+        bending_stiffness: N m, plate rigidity.
+        damping_time: s, Rayleigh coefficient of the elastic forces.
+        drag_normal: -, drag coefficient of each triangle along its normal.
+        air_density: kg/m^3.
+        gravity: m/s^2, along the world's z.
+    """
+
+    rest: Array = field(repr=False)
+    faces: Array = field(repr=False)
+    areal_density: float
+    membrane_stiffness: float
+    poisson_ratio: float
+    bending_stiffness: float
+    damping_time: float = 0.0
+    drag_normal: float = 0.0
+    air_density: float = STANDARD_AIR_DENSITY_KG_PER_M3
+    gravity: float = -STANDARD_GRAVITY_M_PER_S2
+
+    @property
+    def areas(self) -> Array:
+        """Areas [F] m^2 of the triangles at rest."""
+        a, b, c = (self.rest[self.faces[:, k]] for k in range(3))
+        return 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1)
+
+    @property
+    def masses(self) -> Array:
+        """Lumped masses [V] kg."""
+        share = np.repeat(self.areal_density * self.areas / 3, 3)
+        return np.bincount(self.faces.ravel(), share, len(self.rest))
+
+    @property
+    def max_stable_step(self) -> float:
+        """A safe step [s]: 0.8 of the limit of the stiffest mode by the least altitude of a triangle."""
+        corners = self.rest[self.faces]
+        longest = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(1)
+        h = float((2 * self.areas / longest).min())
+        membrane = 8 * self.membrane_stiffness / (1 - self.poisson_ratio**2) / (self.areal_density * h**2)
+        omega = np.sqrt(membrane + 64 * self.bending_stiffness / (self.areal_density * h**4))
+        zeta = 0.5 * self.damping_time * omega
+        return float(STEP_SAFETY_FACTOR * 2 / omega * (np.sqrt(1 + zeta**2) - zeta))
+
+
+class MujocoGarment(MujocoCloth):
+    """A garment in MuJoCo whose gripped vertices follow grippers; runs as ``MujocoCloth``.
+
+    Layers pass through each other, and there is no table.
+
+    Args:
+        spec: the garment and the air.
+        step_fraction: of ``GarmentSpec.max_stable_step``; violent motions stretch cloth, which needs shorter steps.
+
+    Raises:
+        MissingDependency: a MuJoCo whose 2-D elasticity is not the documented one.
+    """
+
+    def __init__(self, spec: GarmentSpec, step_fraction: float = 1.0) -> None:
+        mujoco_cloth.mujoco_version()
+        mujoco = mujoco_cloth.mujoco
+        self.spec, self.dt = spec, step_fraction * spec.max_stable_step  # pyright: ignore[reportAttributeAccessIssue] - gravity is read
+        self.faces, self.mass = spec.faces, spec.masses
+        self.model = mujoco.MjModel.from_xml_string(_flex_xml(spec, self.dt))
+        if self.model.nv != 3 * len(spec.rest):
+            raise InvalidInput("the flex's degrees of freedom", got=self.model.nv, expected=str(3 * len(spec.rest)))
+        self.model.body_mass[1:] = self.mass
+        self.data = mujoco.MjData(self.model)
+        mujoco.mj_setConst(self.model, self.data)
+        self._rest = spec.rest
+        self.force_terms, self.has_implicit_damping = [], True
+        has_drag = spec.drag_normal > 0
+        self._air = StillAir(spec, spec.faces, len(spec.rest)) if has_drag else None  # pyright: ignore[reportArgumentType]
+
+
+def simulate_garment(
+    spec: GarmentSpec, x0: Array, times: Array, grips: Mapping[str, Grip], step_fraction: float = 1.0
+) -> Array:
+    """Let the garment hang still in its grippers from x0 [V, 3] m, move it, and return its final shape [V, 3] m.
+
+    Raises:
+        SimulationDiverged: the simulation is unstable; take a smaller fraction of the step.
+    """
+    garment = MujocoGarment(spec, step_fraction)
+    settling = np.array([0.0, SETTLING_S])
+    x = garment.run(x0, settling, hold_grips(grips), damping_rate=SETTLING_DAMPING_PER_S).x[-1]
+    begin = {name: replace(grip, t=grip.t - times[0]) for name, grip in grips.items()}
+    return garment.run(x, np.array([0.0, times[-1] - times[0]]), begin).x[-1]
+
+
+def _flex_xml(spec: GarmentSpec, dt: float) -> str:
+    points = " ".join(f"{value:.17g}" for value in spec.rest.ravel())
+    elements = " ".join(map(str, spec.faces.ravel()))
+    plate = 12 * (1 - spec.poisson_ratio**2) * spec.bending_stiffness
+    thickness = np.sqrt(plate / spec.membrane_stiffness)
+    return f"""<mujoco>
+      <option timestep="{dt:.17g}" integrator="Euler" gravity="0 0 {spec.gravity}">
+        <flag contact="disable" constraint="disable"/>
+      </option>
+      <size memory="64M"/>
+      <worldbody>
+        <flexcomp name="cloth" type="direct" dim="2" dof="full" mass="1" radius="0.001"
+          point="{points}" element="{elements}">
+          <contact selfcollide="none" contype="0" conaffinity="0"/>
+          <elasticity young="{spec.membrane_stiffness / thickness:.17g}" poisson="{spec.poisson_ratio}"
+            thickness="{thickness:.17g}" damping="{spec.damping_time}" elastic2d="both"/>
+        </flexcomp>
+      </worldbody>
+    </mujoco>"""
