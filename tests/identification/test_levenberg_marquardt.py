@@ -419,3 +419,30 @@ def test_what_was_not_seen_is_no_observation():
             for rows in (of_part, both)
         )
         torch.testing.assert_close(alone, among, rtol=1e-12, atol=0.0)
+
+
+def test_a_step_that_only_damping_makes_downhill_ends_the_search():
+    """Slopes ask for a third of a standard error, and beyond a hundredth the cost rises: it does so everywhere."""
+    one, linearised = torch.ones(1, dtype=torch.float64), []
+
+    def rows(raw, residual):
+        return levenberg_marquardt.Linearised(
+            residual, -one[:, None], one, torch.zeros(1).long(), torch.zeros(1).long()
+        )
+
+    def linearise(raw):
+        linearised.append(raw)
+        return rows(raw, 0.3 - raw)
+
+    def evaluate(raw):
+        is_near = float((raw - linearised[-1]).abs()) < 0.01
+        return (0.3 - raw if is_near else 2 * one), torch.zeros(1).long()
+
+    scales = (one, one, torch.inf * one)
+    problem = levenberg_marquardt.Problem(
+        linearise, evaluate, lambda raw: raw, 0 * one, 1e3 * one, one, 1.0, None, scales
+    )
+    end = levenberg_marquardt.minimise(problem, 0 * one, 35, lambda it: False)
+    assert not end.converged
+    assert 0 < float(end.raw) < 0.01
+    assert len(linearised) == 2

@@ -29,7 +29,8 @@ class SolverSettings:
         min_gain_ratio: actual over predicted decrease, below which the tangents misled a step.
         max_misled_steps: consecutive misled steps that end the search: such tangents say nothing about finite steps.
         max_small_steps: consecutive steps below the tolerance, without an optimum, that end the search: it no longer
-            moves.
+            moves. One ends it if exact slopes asked for a longer step, and only its damped rest went downhill: another
+            one would be damped as much.
         broyden_tolerance: relative error of the predicted decrease up to which an updated Jacobian is good enough.
     """
 
@@ -206,6 +207,7 @@ def minimise(
     for _ in range(iterations):
         if stop:
             break
+        damping_before = damping
         trial, gain_ratio, damping = _step(problem, current, damping, settings)
         if trial is None:
             if current.exact:  # no step helps
@@ -221,7 +223,8 @@ def minimise(
                 converged = True
                 break
             small_steps += 1
-            stop = stop or small_steps == settings.max_small_steps
+            was_blocked = before.exact and damping > damping_before
+            stop = stop or was_blocked or small_steps == settings.max_small_steps
             current = _linearise(problem, trial.raw)
         else:
             small_steps = 0
