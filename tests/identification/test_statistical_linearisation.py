@@ -163,12 +163,10 @@ def test_rounds_end_where_nothing_could_become_identifiable():
 
 def test_rounds_that_know_less_and_come_no_nearer_end_the_search(monkeypatch):
     """Errors that grow would make any move small: such a round has not converged either."""
-    errors, rounds = iter([0.1, 0.2, 100.0, 100.0, 100.0]), []
-    monkeypatch.setattr(
-        statistical_linearisation.levenberg_marquardt,
-        "inflate_covariance",
-        lambda covariance, variances: torch.eye(3, dtype=torch.float64) * next(errors) ** 2,
-    )
+    errors, rounds = iter([0.01, 0.02, 100.0, 100.0]), []
+    covariance = lambda problem, at: torch.eye(3, dtype=torch.float64) * next(errors) ** 2  # noqa: E731
+    monkeypatch.setattr(levenberg_marquardt, "covariance", covariance)
+    monkeypatch.setattr(levenberg_marquardt, "inflate_covariance", lambda covariance, variances: covariance)
     problem = Rippling(0)
     monkeypatch.setattr(problem, "mean_distance", lambda raw: 1.0, raising=False)
     result = statistical_linearisation.fit_by_sampling(problem, FAILED, None, 8, rounds.append)
