@@ -10,7 +10,7 @@ from torchcloth import meshes
 from torchcloth.errors import InvalidInput
 from torchcloth.pose.first_shape import load_network, save_network
 from torchcloth.pose.network import PoseEstimator, PoseNetworkConfig
-from torchcloth.pose.scene_frame import PoseInputs, build_scene_frame, rest_coordinates
+from torchcloth.pose.scene_frame import PoseInputs, build_scene_frame, move_to_grippers, rest_coordinates
 
 SMALL = PoseNetworkConfig(width=16, heads=2, point_blocks=1, latents=4, vertex_blocks=1, refinements=2, hypotheses=3)
 SHEET = meshes.rectangle(0.4, 0.3, triangles=60)
@@ -186,3 +186,32 @@ def test_a_file_that_is_no_network_is_one_clear_error(tmp_path, kind):
 def test_a_missing_file_is_one_clear_error(tmp_path):
     with pytest.raises(InvalidInput, match="no such file"):
         load_network(tmp_path / "none.safetensors")
+
+
+# -- grippers ---------------------------------------------------------------------------------------------------------
+
+
+def test_what_is_held_comes_to_its_gripper_where_the_network_is_unsure():
+    inputs = make_inputs()
+    frame = build_scene_frame(inputs)
+    x = frame.to_world(frame.hang(frame.rest_to_scene(inputs.rest)))
+    shifted = x + torch.tensor([0.02, 0.0, 0.01]).double()
+    resting = inputs._replace(grip_velocity=torch.zeros_like(inputs.grip_velocity))
+    held = inputs.grip[0] == 1
+    unsure = move_to_grippers(shifted, torch.full(x.shape[:2], 0.05).double(), resting)
+    sure = move_to_grippers(shifted, torch.full(x.shape[:2], 1e-5).double(), resting)
+    assert (unsure[0, held].mean(0) - inputs.grip_position[0, 0]).norm() < 1e-3
+    torch.testing.assert_close(sure, shifted, rtol=0, atol=1e-5)
+    lowest = x[0, :, 2].argmin()  # far from the grippers
+    assert (unsure - shifted)[0, lowest].norm() < 0.3 * (unsure - shifted)[0, held].norm(dim=-1).mean()
+
+
+def test_a_fast_gripper_is_believed_less_because_its_clock_may_be_off():
+    inputs = make_inputs()
+    x = inputs.rest.roll(1, -1) + inputs.grip_position[:, :1]
+    std = torch.full(x.shape[:2], 0.01).double()
+    slow, fast = (
+        move_to_grippers(x, std, inputs._replace(grip_velocity=torch.full_like(inputs.grip_velocity, speed))) - x
+        for speed in (0.0, 2.0)
+    )
+    assert float(fast.norm()) < 0.5 * float(slow.norm())

@@ -24,8 +24,8 @@ from ..errors import InvalidInput, RecordingError, SimulationDiverged
 from ..losses import chamfer_to_surface
 from ..meshes import Mesh
 from ..recordings import Recording
-from .network import PoseEstimator, PoseNetworkConfig, PosePrediction
-from .scene_frame import PoseInputs, rest_coordinates
+from .network import PoseEstimator, PoseNetworkConfig
+from .scene_frame import PoseInputs, move_to_grippers, rest_coordinates
 
 SHIPPED_NETWORK = Path(__file__).with_name("pose_network.safetensors")
 NETWORK_FORMAT = "torchcloth-pose-network-1"
@@ -198,11 +198,15 @@ def estimate_first_shape(
     episode = build_episode(cloth, _with_second_cloud(bare) if is_single else bare)
     rest = recorded_rest_coordinates(cloth, recording)
     with torch.no_grad():
-        first = network(pose_inputs(cloth, episode, 0, rest), samples)
-        hypotheses, std, weights = first.hypotheses[0], first.hypothesis_std[0], first.weights[0]
+        inputs = pose_inputs(cloth, episode, 0, rest)
+        first = network(inputs, samples)
+        std, weights = first.hypothesis_std[0], first.weights[0]
+        hypotheses = torch.cat(
+            [move_to_grippers(x[None], s[None], inputs) for x, s in zip(first.hypotheses[0], std, strict=True)]
+        )
         if is_single:
             return FirstShape(hypotheses[0], std[0], None, _distances_now(cloth, episode, hypotheses), weights)
-        velocities = _velocities(network, cloth, episode, rest, first)
+        velocities = _velocities(network, cloth, episode, rest, first.v[0], hypotheses)
         distances = torch.stack(
             [_distance_ahead(cloth, episode, x, v) for x, v in zip(hypotheses, velocities, strict=True)]
         )
@@ -225,13 +229,13 @@ def _distances_now(cloth: Cloth, episode: Episode, hypotheses: Tensor) -> Tensor
 
 
 def _velocities(
-    network: PoseEstimator, cloth: Cloth, episode: Episode, rest: Tensor, first: PosePrediction
+    network: PoseEstimator, cloth: Cloth, episode: Episode, rest: Tensor, first: Tensor, hypotheses: Tensor
 ) -> Sequence[Tensor]:
-    """Velocity [V, 3] m/s of each hypothesis, from the next cloud where there is one in time."""
+    """Velocity [V, 3] m/s of each hypothesis, from the next cloud where it comes in time, else that of the first."""
     has_next = len(episode.clouds) > 1 and len(episode.clouds[1]) > 0
     if not has_next or float(episode.times[1] - episode.times[0]) > 2 * CLOUD_PERIOD_S:
-        return [first.v[0]] * first.hypotheses.shape[1]
-    return [network(pose_inputs(cloth, episode, 1, rest, x)).v[0] for x in first.hypotheses[0]]
+        return [first] * len(hypotheses)
+    return [network(pose_inputs(cloth, episode, 1, rest, x)).v[0] for x in hypotheses]
 
 
 def _distance_ahead(cloth: Cloth, episode: Episode, x: Tensor, v: Tensor) -> Tensor:

@@ -11,7 +11,8 @@ from torch import Tensor
 from ..meshes import Mesh
 
 MIN_GRIP_DISTANCE_M = 0.02  # of two grips along the cloth, and horizontally; nearer ones give no direction
-VERTICAL_AXIS = 2
+GRIP_STD_M, GRIP_LAG_STD_S = 2e-3, 0.010  # of a gripper's reported place, and of its time against the cloud's
+GRIP_REACH = 0.25  # of fabric that moves along with a held patch, in the scene's unit of length
 
 
 class PoseInputs(NamedTuple):
@@ -156,6 +157,30 @@ def build_scene_frame(inputs: PoseInputs) -> SceneFrame:
     spread = torch.where(is_pair, across[:, :2].norm(dim=-1, keepdim=True) / length, 1.0)
     rise = torch.where(is_pair, sign * across[:, 2:] / length, 0.0)
     return SceneFrame(origin, axes, rest_origin, rest_axes, scale, spread, rise)
+
+
+def move_to_grippers(x: Tensor, std: Tensor, inputs: PoseInputs, grip_std: float = GRIP_STD_M) -> Tensor:
+    """Return positions [B, V, 3] m, moved smoothly so that what is held comes nearer to its gripper.
+
+    The robot says where its grippers are to ``grip_std`` [m], and earlier or later than the cloud by
+    `GRIP_LAG_STD_S`. The network says it with its own standard deviation [B, V] m. The held patch comes to their
+    weighted mean, and fabric nearby moves along.
+    """
+    moved = torch.zeros_like(x)
+    share = x.new_zeros(*x.shape[:2], 1)
+    reach = build_scene_frame(inputs).scale[..., None] * GRIP_REACH
+    for k in (0, 1):
+        is_held = (inputs.grip == k + 1) & inputs.exists & inputs.grip_position[:, k].isfinite().all(-1)[:, None]
+        offset = inputs.grip_position[:, k].nan_to_num() - _masked_mean(x, is_held)
+        speed = inputs.grip_velocity[:, k].nan_to_num().norm(dim=-1)
+        variance_grip = grip_std**2 + (GRIP_LAG_STD_S * speed).square()
+        variance = _masked_mean(std[..., None], is_held)[:, 0].square()
+        weight = variance / (variance + variance_grip) * is_held.any(-1)
+        distance = (inputs.rest - _masked_mean(inputs.rest, is_held)[:, None]).norm(dim=-1, keepdim=True)
+        kernel = (-0.5 * (distance / reach).square()).exp()
+        moved = moved + kernel * (weight[:, None] * offset)[:, None]
+        share = share + kernel
+    return x + moved / share.clamp_min(1.0)
 
 
 def _horizontal_direction(inputs: PoseInputs, local: Tensor, origin: Tensor) -> Tensor:

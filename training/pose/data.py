@@ -19,7 +19,7 @@ from functools import partial
 from itertools import pairwise
 from multiprocessing import get_context
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import lightning.pytorch as pl
 import numpy as np
@@ -276,7 +276,7 @@ def _make_group(folder: Path, split: Split, seeds: Sequence[int]) -> Counter[str
     for seed in seeds:
         motion = make_motion(seed, split)
         with write_atomically(motion_path(folder, seed)) as part:
-            np.savez(part, **motion)
+            np.savez(part, **cast("dict[str, Any]", motion))
         counts.update(motions=1, samples=len(motion.get("times", ())), rejected=int(str(motion["rejected"]) != ""))
     return counts
 
