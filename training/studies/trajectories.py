@@ -74,7 +74,7 @@ class Scale:
 
     triangles: int = 200
     gap: float = 0.1
-    waypoints: int = 3
+    waypoints: int = 2
     newton: int = 6
     adam: int = 60
     sac: int = 5000
