@@ -49,6 +49,7 @@ def test_it_is_an_environment(scene):
     check_env(ReachEnv(task_of(scene())), skip_render_check=True)
 
 
+@pytest.mark.long
 def test_the_registered_environment_is_clean():
     from gymnasium.utils.env_checker import check_env
 
@@ -56,6 +57,7 @@ def test_the_registered_environment_is_clean():
     check_env(env.unwrapped, skip_render_check=True)
 
 
+@pytest.mark.long
 def test_scenes_of_a_batch_move_as_alone():
     batch = gymnasium.make_vec("torchcloth/Reach-v0", num_envs=3, garment="dress")
     alone = batch.env
@@ -98,6 +100,7 @@ def test_a_torn_scene_of_a_batch_ends_alone(monkeypatch):
         ReachVectorEnv(batch.env, 0)
 
 
+@pytest.mark.long
 def test_sac_learns_on_a_batch_of_scenes():
     result = learn(task_of(make_hand_episode()), motions=10, random_motions=4, scenes=4)
     assert len(result.history) == len(result.seconds) == 11

@@ -35,13 +35,15 @@ def test_the_goal_is_elsewhere_and_can_be_reached():
     assert goal.points.shape == (trajectories.GOAL_POINTS, 3)
 
 
+@pytest.mark.long
 def test_a_carried_garment_is_brought_to_the_goal_within_all_limits():
     scene = build_scene("dress", "carry", FAST_SCALE.coarse, FAST_SCALE.waypoints)
     goal = make_hidden_goal(scene, np.random.default_rng(0))
-    descent = search_by_gauss_newton([scene], goal, 2)
+    descent = search_by_gauss_newton([scene], goal, 1)
     by_chance = search_by_cmaes(scene, goal, descent.history[-1].seconds, seed=0)
-    assert descent.history[-1].motions == 3 + 2 * len(descent.best)
-    assert descent.expected < by_chance.expected < descent.history[0].distance
+    assert descent.history[-1].motions == 2 + len(descent.best)
+    assert descent.expected < 0.5 * descent.history[0].distance
+    assert by_chance.expected < descent.history[0].distance
     for outcome in (descent, by_chance):
         assert check_limits(outcome.task, outcome.best)[0] == 0
     assert check_limits(descent.task, 20 * descent.best)[0] > 0
