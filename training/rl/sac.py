@@ -103,7 +103,7 @@ def _as_vec_env(env: ReachVectorEnv) -> Any:
     class VecEnvAdapter(VecEnv):
         def __init__(self) -> None:
             super().__init__(env.num_envs, env.single_observation_space, env.single_action_space)
-            self.actions = np.zeros(env.action_space.shape)  # pyright: ignore[reportArgumentType] - a Box
+            self.actions = np.zeros((env.num_envs, env.env.count))
 
         def reset(self) -> np.ndarray:
             return env.reset()[0]

@@ -71,7 +71,7 @@ class ReachVectorEnv(gymnasium.vector.VectorEnv):
         infos: dict[str, Any] = {"distance": distances, "_distance": np.ones(count, dtype=bool)}
         if over.any():
             final = np.full(count, None, dtype=object)
-            for i in np.flatnonzero(over):
+            for i in np.flatnonzero(over).tolist():
                 final[i] = observations[i].copy()
                 self.on_motion(FinishedMotion(float(distances[i]), self.at[i]))
                 self.at[i], self.done[i] = env.task.start.clone(), 0

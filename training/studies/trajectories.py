@@ -190,7 +190,7 @@ def run_method(
 
 
 def run_chaos(scale: Scale, garment: str, action: str) -> dict[str, Any]:
-    """Disturb the first shape of a garment by 0.1 mm, under the recorded motion and under hidden ones."""
+    """Measure what a disturbance of 0.1 mm does, under the recorded motion and under hidden ones."""
     torch.set_default_dtype(torch.float64)
     torch.set_num_threads(1)
     coarse, fine = (build_scene(garment, action, mesh, scale.waypoints) for mesh in (scale.coarse, scale.fine))

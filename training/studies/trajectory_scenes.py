@@ -39,7 +39,7 @@ GOAL_POINTS, GOAL_NOISE_M = 1500, 1e-3
 WAIT_TIME_S = 0.3
 HANGING_TIME_S = 1.5  # in which a hanging garment comes to rest before the motion
 CHAOS_DISTURBANCE_M = 1e-4  # of each vertex of the first shape, root mean square
-LIMIT_CHECK_PERIOD_S = 1e-3
+DENSE_CHECK_PERIOD_S = 1e-3
 MIN_LIMIT_EXCESS = 0.01  # fraction of a limit by which a motion exceeds it, above which it is a violation
 
 
@@ -185,7 +185,7 @@ def compare_meshes(coarse: Scene, fine: Scene, motion: Mapping[str, Trajectory])
 
 
 def check_limits(task: PlanningTask, at: Tensor) -> tuple[int, float]:
-    """Check a motion against all limits each ``LIMIT_CHECK_PERIOD_S``, far finer than the searches do.
+    """Check a motion against all limits each ``DENSE_CHECK_PERIOD_S``, far finer than the searches do.
 
     Returns:
         The number of limits (of a coordinate of a gripper: position, velocity, acceleration) that are exceeded by more
@@ -204,7 +204,7 @@ def check_limits(task: PlanningTask, at: Tensor) -> tuple[int, float]:
 
 def _check_densely(course: GripperMotionParameters) -> GripperMotionParameters:
     def times(span) -> Tensor:
-        count = round((span.end - span.begin) / LIMIT_CHECK_PERIOD_S) + 1
+        count = round((span.end - span.begin) / DENSE_CHECK_PERIOD_S) + 1
         return torch.linspace(span.begin, span.end, count, dtype=torch.float64)
 
     dense = type("DenseSpan", (type(course.span),), {"bound_check_times": property(times)})
