@@ -166,7 +166,7 @@ class GraspOffset(AbstractNuisance):
         return torch.einsum("gv,ab->gavb", weight, torch.eye(3).to(weight)).flatten(0, 1)
 
 
-class _FirstStateOffset(AbstractNuisance):
+class FirstStateOffset(AbstractNuisance):
     """Error of the first state: fields along three axes that vanish where the cloth is held.
 
     Args:
@@ -177,6 +177,10 @@ class _FirstStateOffset(AbstractNuisance):
     def __init__(self, std: float | None = None, fields: Tensor | None = None) -> None:
         super().__init__(std)
         self.fields = fields
+
+    def with_fields(self, fields: Tensor) -> FirstStateOffset:
+        """Return the same nuisance with other fields [M, V]."""
+        return type(self)(self.std, fields)
 
     def number_names(self, cloth: Cloth, episode: Episode) -> list[str]:
         """Return names of the fields along three axes."""
@@ -200,7 +204,7 @@ class _FirstStateOffset(AbstractNuisance):
         return torch.einsum("mv,ab->mavb", fields, torch.eye(3).to(fields)).flatten(0, 1)
 
 
-class InitialShapeOffset(_FirstStateOffset):
+class InitialShapeOffset(FirstStateOffset):
     """Error of the first shape."""
 
     name, unit, std = "shape", "m", 0.005
@@ -210,7 +214,7 @@ class InitialShapeOffset(_FirstStateOffset):
         return self._modes(cloth, episode)
 
 
-class InitialVelocityOffset(_FirstStateOffset):
+class InitialVelocityOffset(FirstStateOffset):
     """Error of the velocities at the first frame, of an episode that begins in motion."""
 
     name, unit, std = "velocity", "m/s", 0.2
@@ -239,9 +243,14 @@ NUISANCE_KINDS: dict[str, type[AbstractNuisance]] = {
 
 
 def implied_nuisances(uses: Collection[str], episodes: Sequence[Episode]) -> list[str]:
-    """Return nuisances that data of these kinds always have: no camera sees an edge where it is."""
+    """Return nuisances that these data always have.
+
+    No camera sees an edge where it is. The state of a cloth that moves at the first frame is known with an error, which
+    does not settle.
+    """
     has_points = any(len(cloud) for e in episodes for cloud in e.clouds)
-    return ["rim"] if "points" in uses and has_points else []
+    moves = any(e.initial_velocity is not None for e in episodes)
+    return ["rim"] * ("points" in uses and has_points) + ["shape", "velocity"] * moves
 
 
 def as_stds(wanted: Mapping[str, float | None] | Sequence[str]) -> dict[str, float | None]:

@@ -21,7 +21,7 @@ from ..episodes.observed import TIME_AFTER_KNOT_S, Episode, build_episode, requi
 from ..episodes.unknowns import apply_priors, collect_unknowns
 from ..errors import InvalidInput, RecordingError
 from ..identification.estimators.objective import Objective
-from ..identification.nuisances import add_lookahead, as_stds, implied_nuisances, select_nuisances
+from ..identification.nuisances import FirstStateOffset, add_lookahead, as_stds, implied_nuisances, select_nuisances
 from ..identification.residuals.blocks import select_blocks
 from ..identification.residuals.metrics import MIN_NOISE_SCALE, distance_metrics
 from ..identification.residuals.rigid_carry import carry_rigidly
@@ -82,7 +82,8 @@ def estimate_pose(
             errors are part of the result's.
         window: duration in which the force is constant [s].
         modes: number of smooth fields over the fabric for each axis of the force.
-        nuisances: as in ``identify``: "clock", "camera", "grasp", "shape".
+        nuisances: as in ``identify``: "clock", "camera", "grasp", "shape", "velocity". Where the cloth moves at the
+            first frame, the last two join, in as many fields as the force has.
         use: kinds of data, some of "points", "markers" and "force"; None: all that the recording has.
         noise: least standard deviation by kind of data, as in ``identify``.
         dt: largest substep [s]; None: the stable one.
@@ -122,6 +123,8 @@ def estimate_pose(
     blocks = select_blocks(use)
     implied = implied_nuisances([block.name for block in blocks], [episode])
     selected = select_nuisances(nuisances, implied)
+    if episode.initial_velocity is not None:
+        selected = [n.with_fields(fields) if isinstance(n, FirstStateOffset) else n for n in selected]
     windows, (episode,) = split_into_windows(episode.times, window), add_lookahead([episode], selected)
     windows[-1] = (windows[-1][0], len(episode.times) - 1)  # frames for a late clock are pushed as the last one is
     force = CorrectiveForce(windows, fields, torch.full((modes,), INITIAL_FORCE_STD_M_PER_S2))

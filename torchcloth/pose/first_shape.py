@@ -24,6 +24,7 @@ from ..errors import InvalidInput, RecordingError, SimulationDiverged
 from ..losses import chamfer_to_surface
 from ..meshes import Mesh
 from ..recordings import Recording
+from .consistent_state import make_consistent
 from .network import PoseEstimator, PoseNetworkConfig
 from .scene_frame import PoseInputs, move_to_grippers, rest_coordinates
 
@@ -165,10 +166,15 @@ def _grippers_seen(cloth: Cloth, rest: Tensor) -> list[str]:
 
 def recorded_rest_coordinates(cloth: Cloth, recording: Recording) -> Tensor:
     """Return rest coordinates [V, 3] m of the recording's own vertices, to which ``initial_vertices`` belong."""
+    return rest_coordinates(recorded_mesh(cloth, recording))
+
+
+def recorded_mesh(cloth: Cloth, recording: Recording) -> Mesh:
+    """Return the recording's own mesh; that of the cloth where the recording has none."""
     info = recording.cloth
     if info.vertices is None or info.faces is None:
-        return rest_coordinates(cloth.mesh)
-    return rest_coordinates(Mesh.build(info.vertices, info.faces, info.uv))
+        return cloth.mesh
+    return Mesh.build(info.vertices, info.faces, info.uv)
 
 
 # -- the first shape --------------------------------------------------------------------------------------------------
@@ -180,8 +186,8 @@ def estimate_first_shape(
 ) -> FirstShape:
     """Estimate the shape at the first frame from its cloud, and choose among hypotheses by what follows.
 
-    Each hypothesis is simulated along the grippers' motion with the cloth's values. The one from which the next clouds
-    are least far is returned.
+    Each hypothesis is moved to the nearest state without stretch (`make_consistent`), then simulated along the
+    grippers' motion with the cloth's values. The one from which the next clouds are least far is returned.
 
     Args:
         cloth: the model, with fitted or nominal values.
@@ -207,6 +213,9 @@ def estimate_first_shape(
         if is_single:
             return FirstShape(hypotheses[0], std[0], None, _distances_now(cloth, episode, hypotheses), weights)
         velocities = _velocities(network, cloth, episode, rest, first.v[0], hypotheses)
+        mesh, held = recorded_mesh(cloth, recording), inputs.grip[0].nonzero()[:, 0]
+        states = [make_consistent(mesh, x, v, s, held) for x, v, s in zip(hypotheses, velocities, std, strict=True)]
+        hypotheses, velocities = (torch.stack(parts) for parts in zip(*states, strict=True))
         distances = torch.stack(
             [_distance_ahead(cloth, episode, x, v) for x, v in zip(hypotheses, velocities, strict=True)]
         )
