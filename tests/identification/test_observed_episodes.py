@@ -56,6 +56,13 @@ def test_without_initial_vertices_the_mesh_is_the_first_frame(recording):
     np.testing.assert_array_equal(seen.initial.numpy(), model.mesh.vertices)
 
 
+def test_a_shape_that_is_to_be_estimated_may_be_far_from_the_grippers(recording, model):
+    far = with_cloth(recording, initial_vertices=None)  # the mesh lies flat about the origin
+    with pytest.raises(InvalidInput, match="the held patch 1.05 m from its gripper"):
+        build_episode(model, far)
+    assert build_episode(model, far, has_first_shape=False).motion.keys() == recording.grippers.keys()
+
+
 def test_patches_end_where_they_are_said_to_and_the_first_shape_is_carried_there(recording):
     """Whole vertices would hold 33 mm of them: edges are as long."""
     corner = np.array([[0.0, 0.0]])

@@ -241,13 +241,17 @@ def require_cpu(cloth: Cloth) -> None:
         raise InvalidInput("cloth", got=f"on {device}", expected="a cloth on the CPU", remedy="cloth.cpu()")
 
 
-def build_episode(cloth: Cloth, recording: Recording, rate: float | None = None) -> Episode:
+def build_episode(
+    cloth: Cloth, recording: Recording, rate: float | None = None, has_first_shape: bool = True
+) -> Episode:
     """Check a recording against a cloth and turn it into tensors of the cloth's dtype.
 
     Args:
         cloth: with a grasp for each gripper that holds it.
         recording: of the cloth.
         rate: frame rate along the motion of an episode without measurements [Hz]; None refuses such an episode.
+        has_first_shape: whether the cloth is where the recording or the mesh says at the first frame. Else the shape is
+            to be estimated, and grippers may be far from it.
 
     Raises:
         RecordingError: no measurements, or no motion for one of the cloth's grasps.
@@ -265,9 +269,10 @@ def build_episode(cloth: Cloth, recording: Recording, rate: float | None = None)
     times, frames_after_motion = _frame_times(name, recording, motion, grasps, rate)
     initial = compute_initial_vertices(name, cloth, recording).to(dtype)
     velocity = compute_initial_velocities(cloth, recording)
-    places = _gripper_places(cloth, motion, initial, times[0])
-    _check_not_exchanged(name, places)
-    _check_gripper_distance(name, places)
+    if has_first_shape:
+        places = _gripper_places(cloth, motion, initial, times[0])
+        _check_not_exchanged(name, places)
+        _check_gripper_distance(name, places)
     markers = streams.gather_markers(recording, times, dtype)
     camera, uv = find_depth_camera(recording), None if recording.markers is None else recording.markers.uv
     is_late_reading = streams.find_force_times(recording, grasps) > times[-1] + float(np.diff(times).max())

@@ -201,7 +201,7 @@ def estimate_first_shape(
     network = network or load_network()
     bare = replace(recording, cloth=replace(recording.cloth, initial_vertices=None, initial_velocities=None))
     is_single = recording.points is not None and len(recording.points) == 1
-    episode = build_episode(cloth, _with_second_cloud(bare) if is_single else bare)
+    episode = build_episode(cloth, _with_second_cloud(bare) if is_single else bare, has_first_shape=False)
     rest = recorded_rest_coordinates(cloth, recording)
     with torch.no_grad():
         inputs = pose_inputs(cloth, episode, 0, rest)
