@@ -3,10 +3,18 @@
 from __future__ import annotations
 
 import json
+import os
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 
+import torchcloth as tc
+from torchcloth import recordings
 from torchcloth.pose.first_shape import load_network
 from torchcloth.pose.network import PoseEstimator, PoseNetworkConfig
 from torchcloth.training.pose import train
@@ -15,6 +23,7 @@ from torchcloth.training.pose.data import PoseDataset, collate, make_data
 from torchcloth.training.pose.module import PoseLossWeights, PoseTraining
 from torchcloth.training.pose.physics_loss import PhysicsLoss
 from torchcloth.training.pose.train import evaluate
+from torchcloth.training.pose.unlabelled import write_unlabelled
 
 SMALL = PoseNetworkConfig(width=16, heads=2, point_blocks=1, latents=4, vertex_blocks=1, refinements=2, hypotheses=2)
 STEP = 1e-6
@@ -68,6 +77,21 @@ def test_scenes_without_truth_teach_by_physics_alone(batch):
     gradient = module.network.to_correction[-1].weight.grad
     assert bool(gradient.isfinite().all())
     assert float(gradient.norm()) > 0
+
+
+def test_a_recording_becomes_training_data_without_truth(tmp_path):
+    """Its clouds are near its own first shape."""
+    recording = recordings.read(Path(tc.__file__).with_name("examples") / "bimanual_swing")
+    recording = replace(recording, points=recording.points.select(slice(0, 4)))
+    assert write_unlabelled(tmp_path, [recording]) == 4
+    sample = PoseDataset(tmp_path)[0]
+    assert bool(np.isnan(sample.x).all())
+    assert np.isfinite(sample.next_times).all()
+    x = torch.as_tensor(recording.cloth.initial_vertices)
+    fabric, physics = torch.as_tensor(sample.fabric).double(), PhysicsLoss()
+    right, wrong = (float(physics.distance_ahead(x + shift, 0 * x, fabric, sample)) for shift in (0.0, 0.02))
+    assert right < 4e-3
+    assert wrong > 3 * right
 
 
 def test_gradients_of_the_physics_agree_with_finite_differences(batch):
@@ -124,9 +148,25 @@ def test_the_command_trains_resumes_and_writes_weights(folder, tmp_path, capsys,
     assert main([*arguments, "--steps", "6", "--width", "16", "--resume"]) == 0
 
 
+@pytest.mark.slow
+def test_two_processes_train_one_network(folder, tmp_path):
+    """By Lightning's DDP; each takes every other batch."""
+    command = [sys.executable, "-m", "torchcloth.training.pose", "--data", str(folder), "--held-out", str(folder)]
+    command += ["--out", str(tmp_path), "--batch", "4", "--steps", "4", "--width", "16", "--processes", "2"]
+    done = subprocess.run(command, capture_output=True, text=True, env={**os.environ, "OMP_NUM_THREADS": "1"})
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.count("held out") == 1
+    assert load_network(tmp_path / "pose_network.safetensors").description["width"] == 16
+
+
 @pytest.mark.parametrize(
     ("option", "expected"),
-    [(["--steps", "-1"], "--steps"), (["--processes", "0"], "--processes"), (["--data", "none"], "data")],
+    [
+        (["--steps", "-1"], "--steps"),
+        (["--processes", "0"], "--processes"),
+        (["--data", "none"], "data"),
+        (["--processes", "2", "--physics-steps", "1"], "one of them"),
+    ],
 )
 def test_wrong_input_is_one_line(tmp_path, capsys, option, expected):
     assert main(["--out", str(tmp_path / "out"), "--held-out", str(tmp_path), *option]) == 2

@@ -13,6 +13,7 @@ from typing import Any
 import lightning.pytorch as pl
 import torch
 from lightning.pytorch.callbacks import Callback, ModelCheckpoint
+from lightning.pytorch.utilities import rank_zero_only
 from torch import Tensor
 
 from torchcloth._utils.constants import Z_95
@@ -66,7 +67,7 @@ def train(
     held_out: Path,
     unlabelled: Path | None = None,
     resume: bool = False,
-) -> dict[str, Any]:
+) -> dict[str, Any] | None:
     """Train, calibrate the standard deviations on held-out scenes, and write weights and a report.
 
     Args:
@@ -79,7 +80,7 @@ def train(
         resume: go on from the checkpoints in ``out``.
 
     Returns:
-        The report.
+        The report; None in all processes but the first.
 
     Raises:
         InvalidInput: data that are no folder of motions, or nothing to resume.
@@ -91,11 +92,14 @@ def train(
     seconds = {}
     if plan.steps:
         seconds["supervised"] = _run_stage("supervised", supervised, plan, plan.steps, out, data, None, resume)
-        save_network(network, out / "supervised.safetensors")
+        if rank_zero_only.rank == 0:
+            save_network(network, out / "supervised.safetensors")
     if plan.physics_steps:
         weights = replace(PoseLossWeights(), physics=plan.physics_weight)
         module = PoseTraining(network, weights, plan.physics_learning_rate, plan.physics_steps, warm_up=50)
         seconds["physics"] = _run_stage("physics", module, plan, plan.physics_steps, out, data, unlabelled, resume)
+    if rank_zero_only.rank:
+        return None
     report = evaluate(network, held_out)
     report = {**report, "plan": plan.__dict__, "seconds": {**seconds, "all": time.monotonic() - began}}
     save_network(network, out / NETWORK_FILE)
