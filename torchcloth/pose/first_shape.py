@@ -139,8 +139,8 @@ def pose_inputs(
     generator = torch.Generator().manual_seed(seed)
     drawn = torch.cat([torch.randperm(len(cloud), generator=generator) for _ in range(-(-POINTS_SEEN // len(cloud)))])
     grip = torch.zeros(len(rest), dtype=torch.int64)
-    position, velocity = torch.full((2, 3), torch.nan), torch.zeros(2, 3)
-    for k, name in enumerate(_grippers_seen(cloth, rest)):
+    position, velocity = rest.new_full((2, 3), torch.nan).float(), rest.new_zeros(2, 3).float()
+    for k, name in enumerate(find_grippers(cloth, rest)):
         boundary, trajectory = cloth.boundaries[name], episode.motion[name]
         assert isinstance(boundary, Grasp)
         first, last = float(trajectory.t[0]), float(trajectory.t[-1])
@@ -149,12 +149,12 @@ def pose_inputs(
         places = interpolate_poses(trajectory, times.to(trajectory.t))[:, :3, 3].float()
         grip[boundary.index] = k + 1
         position[k], velocity[k] = places[1], (places[2] - places[0]) / float(times[2] - times[0])
-    before = torch.full((len(rest), 3), torch.nan) if previous is None else previous.float()
+    before = rest.new_full((len(rest), 3), torch.nan).float() if previous is None else previous.float()
     parts = (cloud[drawn[:POINTS_SEEN]].float(), rest.float(), torch.ones(len(rest), dtype=torch.bool), grip)
     return PoseInputs(*(part.unsqueeze(0) for part in (*parts, position, velocity, before)))
 
 
-def _grippers_seen(cloth: Cloth, rest: Tensor) -> list[str]:
+def find_grippers(cloth: Cloth, rest: Tensor) -> list[str]:
     """Names of at most two grasps, those that are farthest apart on the fabric."""
     names = [name for name, part in cloth.boundaries.items() if isinstance(part, Grasp)]
     if len(names) <= 2:

@@ -126,7 +126,7 @@ def build_scene_frame(inputs: PoseInputs) -> SceneFrame:
     alone = torch.stack([-down[:, 1], down[:, 0]], -1)
     rest_x = _unit(torch.where(is_pair, across_rest[:, :2], alone), inputs.rest.new_tensor([1.0, 0.0]))
     height = rest_x[:, 0] * down[:, 1] - rest_x[:, 1] * down[:, 0]
-    sign = torch.where(height > 0, -1.0, 1.0).unsqueeze(-1)
+    sign = (1 - 2 * (height > 0).to(rest)).unsqueeze(-1)
     rest_x = sign * rest_x
     zero, one = torch.zeros_like(height), torch.ones_like(height)
     rest_axes = torch.stack(
