@@ -261,3 +261,13 @@ def test_figures_of_a_fit_name_what_they_count():
     """``fit`` is one flat object of numbers."""
     assert set(DistanceMetrics._fields) == {"chamfer", "rms", "per_frame"}
     assert all(isinstance(value, float) for value in outcome().as_dict()["fit"].values())
+
+
+def test_errors_that_add_up_to_more_than_the_prior_end_at_its_width(model):
+    """A considered grip once made a deviation of thousands in the logarithm, and an infinite interval."""
+    unknowns = collect_unknowns(model, ("youngs_modulus",), None)
+    raw = torch.tensor([unknowns[0].start])
+    estimate = make_estimates(model, unknowns, raw, torch.tensor([[4e6]])).parameters["youngs_modulus"]
+    assert estimate.std == pytest.approx(estimate.value * unknowns[0].prior_std)
+    assert estimate.ci95[1] / estimate.value == pytest.approx(math.exp(1.96 * unknowns[0].prior_std), rel=1e-3)
+    assert not estimate.identifiable

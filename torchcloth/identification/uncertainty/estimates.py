@@ -236,6 +236,7 @@ def apply_profiles(estimates: EstimateSet, profiles: Mapping[str, Profile]) -> E
 
 def _estimate(unknown: Unknown, raw: float, deviation: float, criteria: IdentifiabilityCriteria) -> Estimate:
     value = unknown.value(raw)
+    deviation = min(deviation, unknown.prior_std)  # errors that are considered may add up to more than is known anyway
     std = unknown.slope(raw) * deviation
     half_width = Z_95 * deviation
     low, high = (unknown.value(unknown.clip(raw + sign * half_width)) for sign in (-1, 1))
