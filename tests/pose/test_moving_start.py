@@ -13,7 +13,8 @@ from torchcloth.identification import build_episode
 from torchcloth.identification.nuisances import NUISANCE_KINDS, implied_nuisances, select_nuisances
 from torchcloth.identification.residuals.blocks import select_blocks
 from torchcloth.identification.uncertainty.richardson import refine_cloth, refine_recording
-from torchcloth.pose import estimate_pose
+from torchcloth.pose import PosePrediction, estimate_pose, rest_coordinates
+from torchcloth.pose.first_shape import _velocities
 from torchcloth.pose.modes import compute_modes
 from torchcloth.pose.objective import CorrectedObjective, CorrectiveForce, add_correction_effect, split_into_windows
 
@@ -99,3 +100,36 @@ def test_the_finer_mesh_begins_with_the_same_velocities(scene, later):
     count = len(cloth.mesh.vertices)
     velocity = build_episode(fine, refined).initial_velocity
     torch.testing.assert_close(velocity[:count], torch.as_tensor(later[0].cloth.initial_velocities), rtol=0, atol=0.02)
+
+
+class _Answers:
+    """A network that says at each call where the cloth is, with an error that stays, among other hypotheses."""
+
+    def __init__(self, frames):
+        self.frames, self.calls = frames, 0
+
+    def __call__(self, inputs, samples=1):
+        self.calls += 1
+        x = (self.frames[self.calls] + 0.01).float()
+        hypotheses = torch.stack([x + 0.1, x])[None]
+        nothing = torch.zeros(1)
+        return PosePrediction(x[None], nothing, x[None], hypotheses, nothing, nothing, nothing, nothing)
+
+
+@pytest.mark.parametrize("has_next_clouds", [True, False])
+def test_velocities_are_slopes_of_the_answers_to_the_next_clouds(scene, later, has_next_clouds):
+    cloth = build_cloth(scene, twins.TRUE_FABRIC)
+    episode = build_episode(cloth, later[0])
+    if not has_next_clouds:
+        episode = replace(episode, clouds=[episode.clouds[0], *(cloud[:0] for cloud in episode.clouds[1:])])
+    frames, network = later[1], _Answers(later[1])
+    first = torch.zeros(1, 2, *frames.shape[1:])
+    prediction = PosePrediction(*[torch.zeros(1)] * 2, first[:, 0], first, *[torch.zeros(1)] * 4)
+    start = (frames[0] + 0.01).float()[None]
+    v = _velocities(network, cloth, episode, rest_coordinates(cloth.mesh), prediction, start)[0]
+    truth = torch.as_tensor(later[0].cloth.initial_velocities).float()
+    if not has_next_clouds:
+        assert float(v.abs().max()) == 0
+        return
+    assert network.calls >= 3
+    assert float((v - truth).square().mean().sqrt()) < 0.35 * float(truth.square().mean().sqrt())

@@ -11,7 +11,7 @@ from ..observe.shape_prior import ShapePrior
 
 EDGE_STRAIN_STD = 0.005  # of a hanging cloth
 STRAIN_RATE_STD_PER_S = 0.05
-HELD_STD_M, HELD_SPEED_STD_M_PER_S = 5e-4, 0.01  # of held vertices, whose place and speed the robot reports
+HELD_STD_M, HELD_SPEED_STD_M_PER_S = 2e-3, 0.02  # of held vertices, whose place and speed the robot reports
 MIN_STD_M = 1e-3
 VELOCITY_STD_M_PER_S = 0.2  # of an estimate from clouds
 PROJECTION_ROUNDS = 6

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
@@ -25,13 +24,13 @@ from ..losses import chamfer_to_surface
 from ..meshes import Mesh
 from ..recordings import Recording
 from .consistent_state import make_consistent
-from .network import PoseEstimator, PoseNetworkConfig
+from .network import PoseEstimator, PoseNetworkConfig, PosePrediction
 from .scene_frame import PoseInputs, move_to_grippers, rest_coordinates
 
 SHIPPED_NETWORK = Path(__file__).with_name("pose_network.safetensors")
 NETWORK_FORMAT = "torchcloth-pose-network-1"
 POINTS_SEEN = 256  # of a cloud, as in training
-CLOUD_PERIOD_S = 1 / 30  # between a cloud and the one before, as in training
+VELOCITY_FIT_S, MIN_VELOCITY_CLOUDS = 0.18, 3  # after the first cloud, through which a parabola is laid
 VELOCITY_STEP_S = 0.01  # of the difference that gives a gripper's velocity
 SINGLE_CLOUD_PERIOD_S = 1e-3
 SIMULATED_FRAMES = 6  # with which hypotheses are compared
@@ -212,7 +211,7 @@ def estimate_first_shape(
         )
         if is_single:
             return FirstShape(hypotheses[0], std[0], None, _distances_now(cloth, episode, hypotheses), weights)
-        velocities = _velocities(network, cloth, episode, rest, first.v[0], hypotheses)
+        velocities = _velocities(network, cloth, episode, rest, first, hypotheses)
         mesh, held = recorded_mesh(cloth, recording), inputs.grip[0].nonzero()[:, 0]
         states = [make_consistent(mesh, x, v, s, held) for x, v, s in zip(hypotheses, velocities, std, strict=True)]
         hypotheses, velocities = (torch.stack(parts) for parts in zip(*states, strict=True))
@@ -238,13 +237,27 @@ def _distances_now(cloth: Cloth, episode: Episode, hypotheses: Tensor) -> Tensor
 
 
 def _velocities(
-    network: PoseEstimator, cloth: Cloth, episode: Episode, rest: Tensor, first: Tensor, hypotheses: Tensor
-) -> Sequence[Tensor]:
-    """Velocity [V, 3] m/s of each hypothesis, from the next cloud where it comes in time, else that of the first."""
-    has_next = len(episode.clouds) > 1 and len(episode.clouds[1]) > 0
-    if not has_next or float(episode.times[1] - episode.times[0]) > 2 * CLOUD_PERIOD_S:
-        return [first] * len(hypotheses)
-    return [network(pose_inputs(cloth, episode, 1, rest, x)).v[0] for x in hypotheses]
+    network: PoseEstimator, cloth: Cloth, episode: Episode, rest: Tensor, first: PosePrediction, hypotheses: Tensor
+) -> Tensor:
+    """Velocity [S, V, 3] m/s of each hypothesis: the slope of a parabola through the answers to the next clouds.
+
+    The answers to clouds that follow each other have most of their error in common, so their differences say more than
+    the velocity that the network sees in one cloud. That one is taken where too few clouds come in time.
+    """
+    times = episode.times - episode.times[0]
+    frames = [t for t in range(1, len(times)) if float(times[t]) <= VELOCITY_FIT_S and len(episode.clouds[t])]
+    if len(frames) < MIN_VELOCITY_CLOUDS:
+        return first.v.expand(len(hypotheses), -1, -1)
+    path, samples = [hypotheses], first.hypotheses.shape[1]
+    for t in frames:
+        answers = network(pose_inputs(cloth, episode, t, rest), samples).hypotheses[0]
+        apart = (path[-1][:, None] - answers).square().sum((-2, -1))
+        path.append(answers[apart.argmin(1)])
+    t = times[[0, *frames]].double()
+    solution = torch.linalg.lstsq(
+        torch.stack([torch.ones_like(t), t, t.square()], 1), torch.stack(path).double().flatten(1)
+    )
+    return solution.solution[1].reshape(hypotheses.shape).to(hypotheses)
 
 
 def _distance_ahead(cloth: Cloth, episode: Episode, x: Tensor, v: Tensor) -> Tensor:
