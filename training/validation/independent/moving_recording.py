@@ -53,6 +53,7 @@ SIDE_RANGE_M, ASPECT_RANGE = (0.30, 0.50), (0.75, 1.0)
 CORNER_SIDE_RANGE_M, CORNER_ASPECT_RANGE = (0.36, 0.46), (0.65, 0.78)
 GRIP_RADIUS_M = 0.026
 EDGE_CLAMP_FRACTION, EDGE_CLAMP_DEPTH_M, EDGE_CLAMP_POINT_SPACING_M = 0.4, 0.015, 0.01  # of the width, for each arm
+PATCH_SAMPLE_SPACING_M = 2e-3
 CLAMP_BAR_SIZE_M, CLAMP_BAR_HEIGHT_M = (0.02, 0.03), 0.01  # thickness and height; its middle above the edge
 DISTANCE_RATIO_RANGE = (0.97, 1.006)  # of the grippers, over the distance of what they hold
 TOP_EDGE_M = (0.50, 0.0)  # x and y of the middle of the grippers at rest
@@ -375,13 +376,22 @@ def _simulate(scene: Scene, hold: _Hold, path: _Path) -> tuple[Result, dict[str,
         apart = np.linalg.norm(uv[:, None] - hold.points[name], axis=-1).min(1)
         vertices = np.flatnonzero(apart <= hold.radius + 1e-9)
         grips[name] = Grip(vertices, path.t, pose)
-        centroids[name] = (x0[vertices].mean(0) - pose[0, :3, 3]) @ pose[0, :3, :3]
+        centroid = middle + hold.place(_patch_centroid(scene.sheet, hold, name)) @ first.T  # type: ignore[operator]
+        centroids[name] = (centroid[0] - pose[0, :3, 3]) @ pose[0, :3, :3]
     step, terms = stable_step(scene), make_force_terms(scene, on_table=False)
     settling_terms = [term for term in terms if term.acts_while_settling]
     settled = MujocoCloth(scene.sheet, step, settling_terms).run(
         x0, np.array([0.0, HANGING_SETTLING_S]), hold_grips(grips), damping_rate=SETTLING_DAMPING_PER_S
     )
     return MujocoCloth(scene.sheet, step, terms).run(settled.x[-1], path.t, grips), centroids
+
+
+def _patch_centroid(sheet: SheetSpec, hold: _Hold, name: str) -> Array:
+    """Return the centroid [1, 2] m of the fabric that a gripper holds."""
+    u, v = (np.linspace(0, side, round(side / PATCH_SAMPLE_SPACING_M) + 1) for side in (sheet.width, sheet.height))
+    uv = np.stack(np.meshgrid(u, v), -1).reshape(-1, 2)
+    apart = np.linalg.norm(uv[:, None] - hold.points[name], axis=-1).min(1)
+    return uv[apart <= hold.radius].mean(0, keepdims=True)
 
 
 def _at_centroid(pose: Array, centroid: Array) -> Array:
