@@ -33,9 +33,10 @@ from ..recordings import Recording
 from ..recordings.consistency import check_recording
 from ..recordings.size_checks import check_size
 from .fine_scale_uncertainty import estimate_fine_scale_std
-from .first_shape import estimate_first_shape
+from .first_shape import estimate_first_shape, load_network
 from .modes import Modes, check_mode_count, compute_modes
 from .network import PoseEstimator
+from .network_answers import add_network_answers
 from .objective import CorrectedObjective, CorrectiveForce, add_correction_effect, split_into_windows
 from .result import PoseEstimate
 from .smoothing import SmoothedPose, smooth
@@ -92,7 +93,7 @@ def estimate_pose(
             The result has no frames where clouds were frozen. A clock that is off is corrected, and becomes a nuisance.
         start: where the first shape comes from: the recording; the shipped network (`estimate_first_shape`), which also
             tells how fast the cloth moves; or a network of one's own. A network's shape is a start: the nuisance
-            "shape" is added with its error.
+            "shape" is added with its error. Its answers to all clouds count as data, unless ``use`` says what counts.
 
     Returns:
         Frames with standard errors, visibility, forces, warnings.
@@ -113,8 +114,12 @@ def estimate_pose(
         (recording,), notes, clock_std = check_all([recording])
         nuisances = nuisances if clock_std is None else {"clock": clock_std, **nuisances}
     if start != "recording":
-        shape = estimate_first_shape(cloth, recording, _network_of(start))
+        network = _network_of(start)
+        shape = estimate_first_shape(cloth, recording, network)
         recording, nuisances = shape.apply(recording), {"shape": shape.std_rms, **nuisances}
+        if recording.markers is None and use is None and cloth.mesh.uv is not None:
+            recording, std = add_network_answers(cloth, recording, network)
+            noise = {"markers": std, **(noise or {})}
     check_mode_count(cloth.mesh, modes)
     episode, all_modes = build_episode(cloth, recording), compute_modes(cloth.mesh)
     fields = all_modes.fields[:modes].to(episode.initial)
@@ -144,11 +149,10 @@ def estimate_pose(
     return replace(estimate, warnings=[*notes, *estimate.warnings])
 
 
-def _network_of(start: str | PoseEstimator) -> PoseEstimator | None:
-    """The network of a start; None: the shipped one."""
+def _network_of(start: str | PoseEstimator) -> PoseEstimator:
     if isinstance(start, str) and start != "network":
         raise InvalidInput("start", got=repr(start), expected="'recording', 'network' or a PoseEstimator")
-    return None if isinstance(start, str) else start
+    return load_network() if isinstance(start, str) else start
 
 
 def _assemble_result(

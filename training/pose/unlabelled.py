@@ -47,7 +47,7 @@ def make_unlabelled_motion(recording: Recording, number: int) -> dict[str, Array
         number: of its file.
     """
     cloth = identification.build_cloth(recording)
-    episode = identification.build_episode(cloth, recording)
+    episode = identification.build_episode(cloth, recording, has_first_shape=False)
     rest = recorded_rest_coordinates(cloth, recording)
     frames = [k for k, cloud in enumerate(episode.clouds) if len(cloud) >= MIN_CLOUD_POINTS]
     seen = [pose_inputs(cloth, episode, frame, rest, seed=frame) for frame in frames]
