@@ -38,7 +38,7 @@ from torchcloth.pose.scene_frame import build_scene_frame
 from torchcloth.pose.visibility import find_seen_vertices
 from torchcloth.recordings import Recording
 
-from ..resumable import ResumableStudy, check_jobs, write_result
+from ..resumable import ResumableStudy, write_result
 from ..validation.independent.flex_sheet import SheetSpec, interpolate_bilinear
 from ..validation.independent.moving_recording import MovingRecording, MovingSize, make_moving_recording
 from .geometric_baselines import register_frames
@@ -86,12 +86,10 @@ def add(parser: argparse.ArgumentParser) -> None:
         "--network", action="append", metavar="NAME=FILE", help="weights to compare, more than once (the shipped ones)"
     )
     parser.add_argument("--true-start", action="store_true", help="the smoother from the true first shape, too")
-    parser.add_argument("--jobs", type=int, default=1, metavar="N", help="cases at a time (1)")
 
 
 def run(options: argparse.Namespace) -> None:
     """Make the missing episodes, compute the missing cases, print and write tables and pictures."""
-    check_jobs(options.jobs)
     count = (FAST_EPISODE_COUNT if options.fast else EPISODE_COUNT) if options.episodes is None else options.episodes
     if count < 1 or options.first < 0:
         raise InvalidInput("--episodes, --first", got=f"{count}, {options.first}", expected="1 or more; 0 or more")
@@ -110,7 +108,7 @@ def run(options: argparse.Namespace) -> None:
         if options.true_start:
             for kind in TRUE_START:
                 cases[f"{seed:03d}, {kind}"] = partial(_true_start_case, load, kind == TRUE_START[1], fast)
-    finished = study.run(cases, options.jobs)
+    finished = study.run(cases)
     results = {
         seed: {"facts": _read_facts(options.out, seed), **_collect(finished, seed, networks, options.true_start)}
         for seed in seeds
