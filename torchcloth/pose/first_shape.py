@@ -30,7 +30,8 @@ from .scene_frame import PoseInputs, move_to_grippers, rest_coordinates
 SHIPPED_NETWORK = Path(__file__).with_name("pose_network.safetensors")
 NETWORK_FORMAT = "torchcloth-pose-network-1"
 POINTS_SEEN = 256  # of a cloud, as in training
-VELOCITY_FIT_S, MIN_VELOCITY_CLOUDS = 0.18, 3  # after the first cloud, through which a parabola is laid
+VELOCITY_FIT_S, MIN_VELOCITY_CLOUDS = 0.14, 3  # after the first cloud, through which a parabola is laid
+MAX_PARABOLA_RESIDUAL_M = 0.01  # rms over vertices, above which answers jump from one side of the cloth to the other
 VELOCITY_STEP_S = 0.01  # of the difference that gives a gripper's velocity
 SINGLE_CLOUD_PERIOD_S = 1e-3
 SIMULATED_FRAMES = 6  # with which hypotheses are compared
@@ -242,7 +243,8 @@ def _velocities(
     """Velocity [S, V, 3] m/s of each hypothesis: the slope of a parabola through the answers to the next clouds.
 
     The answers to clouds that follow each other have most of their error in common, so their differences say more than
-    the velocity that the network sees in one cloud. That one is taken where too few clouds come in time.
+    the velocity that the network sees in one cloud. That one is taken where too few clouds come in time, or where the
+    answers jump.
     """
     times = episode.times - episode.times[0]
     frames = [t for t in range(1, len(times)) if float(times[t]) <= VELOCITY_FIT_S and len(episode.clouds[t])]
@@ -253,11 +255,13 @@ def _velocities(
         answers = network(pose_inputs(cloth, episode, t, rest), samples).hypotheses[0]
         apart = (path[-1][:, None] - answers).square().sum((-2, -1))
         path.append(answers[apart.argmin(1)])
-    t = times[[0, *frames]].double()
-    solution = torch.linalg.lstsq(
-        torch.stack([torch.ones_like(t), t, t.square()], 1), torch.stack(path).double().flatten(1)
-    )
-    return solution.solution[1].reshape(hypotheses.shape).to(hypotheses)
+    t, x = times[[0, *frames]].double(), torch.stack(path).double().flatten(2)
+    powers = torch.stack([torch.ones_like(t), t, t.square()], 1)
+    coefficients = torch.linalg.lstsq(powers, x.flatten(1)).solution.unflatten(1, x.shape[1:])
+    residual = (x - torch.einsum("tk,ksn->tsn", powers, coefficients)).square().sum(-1).mean(0)
+    jumps = (residual / hypotheses.shape[1]).sqrt() > MAX_PARABOLA_RESIDUAL_M
+    slope = coefficients[1].reshape(hypotheses.shape).to(hypotheses)
+    return torch.where(jumps[:, None, None], first.v.to(hypotheses), slope)
 
 
 def _distance_ahead(cloth: Cloth, episode: Episode, x: Tensor, v: Tensor) -> Tensor:
