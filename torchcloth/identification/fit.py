@@ -370,7 +370,7 @@ def _find_misfit(
     if misfit is None:
         return "", {}
     over_start = full.distance_metrics(final.raw).chamfer / chamfer_before if chamfer_before > 0 else 0.0
-    reason = find_misfit(misfit, noise_std, over_start, final.converged)
+    reason = find_misfit(misfit, noise_std, over_start)
     if not reason:
         return "", {}
     reasons = rank_reasons(used, final)
