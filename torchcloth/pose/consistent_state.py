@@ -9,7 +9,7 @@ from ..meshes import Mesh
 from ..observe.least_squares import Equations, expand_to_axes, solve_moves
 from ..observe.shape_prior import ShapePrior
 
-EDGE_STRAIN_STD = 0.005  # of a hanging cloth
+HANGING_STRAIN_STD = 0.005  # of a hanging cloth
 STRAIN_RATE_STD_PER_S = 0.05
 HELD_STD_M, HELD_SPEED_STD_M_PER_S = 2e-3, 0.02  # of held vertices, whose place and speed the robot reports
 MIN_STD_M = 1e-3
@@ -18,7 +18,7 @@ PROJECTION_ROUNDS = 6
 VELOCITY_TIME_SCALE_S = 0.05  # turns velocities into displacements of a size that the solver expects
 
 
-def make_consistent(mesh: Mesh, x: Tensor, v: Tensor | None, std: Tensor, held: Tensor) -> tuple[Tensor, Tensor | None]:
+def make_consistent(mesh: Mesh, x: Tensor, v: Tensor, std: Tensor, gripped: Tensor) -> tuple[Tensor, Tensor]:
     """Return the nearest positions and velocities in which edges keep their length and the cloth bends little.
 
     Errors of single vertices are strains of several per cent, and stiff cloth turns these into motion that no estimate
@@ -29,13 +29,13 @@ def make_consistent(mesh: Mesh, x: Tensor, v: Tensor | None, std: Tensor, held: 
         x: [V, 3] m, estimated positions.
         v: [V, 3] m/s, estimated velocities.
         std: [V] m, standard deviation of a coordinate of ``x``.
-        held: [H], indices of the vertices that grippers hold, whose positions are better known.
+        gripped: [H], indices of the vertices that grippers hold, whose positions are better known.
     """
     start, count = x.detach().double(), len(x)
-    prior = ShapePrior(mesh, start, EDGE_STRAIN_STD)
+    prior = ShapePrior(mesh, start, HANGING_STRAIN_STD)
     each = torch.arange(count)[:, None]
     weight = 1 / std.detach().double().clamp(min=MIN_STD_M)[:, None]
-    weight[held] = 1 / HELD_STD_M
+    weight[gripped] = 1 / HELD_STD_M
     position = start
     for _ in range(PROJECTION_ROUNDS):
         near = expand_to_axes(each, weight, (start - position) * weight)
@@ -46,6 +46,6 @@ def make_consistent(mesh: Mesh, x: Tensor, v: Tensor | None, std: Tensor, held: 
     relative = (speed[prior.edges[:, 1]] - speed[prior.edges[:, 0]]) * VELOCITY_TIME_SCALE_S
     rate = Equations(prior.edges, torch.stack([-along, along], dim=1), -(along * relative).sum(-1))
     weight = torch.full_like(weight, 1 / (VELOCITY_STD_M_PER_S * VELOCITY_TIME_SCALE_S))
-    weight[held] = 1 / (HELD_SPEED_STD_M_PER_S * VELOCITY_TIME_SCALE_S)
+    weight[gripped] = 1 / (HELD_SPEED_STD_M_PER_S * VELOCITY_TIME_SCALE_S)
     change = solve_moves([rate, *expand_to_axes(each, weight, torch.zeros_like(speed))], count)
     return position.to(x), (speed + change / VELOCITY_TIME_SCALE_S).to(v)

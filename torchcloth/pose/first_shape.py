@@ -213,8 +213,8 @@ def estimate_first_shape(
         if is_single:
             return FirstShape(hypotheses[0], std[0], None, _distances_now(cloth, episode, hypotheses), weights)
         velocities = _velocities(network, cloth, episode, rest, first, hypotheses)
-        mesh, held = recorded_mesh(cloth, recording), inputs.grip[0].nonzero()[:, 0]
-        states = [make_consistent(mesh, x, v, s, held) for x, v, s in zip(hypotheses, velocities, std, strict=True)]
+        mesh, gripped = recorded_mesh(cloth, recording), inputs.grip[0].nonzero()[:, 0]
+        states = [make_consistent(mesh, x, v, s, gripped) for x, v, s in zip(hypotheses, velocities, std, strict=True)]
         hypotheses, velocities = (torch.stack(parts) for parts in zip(*states, strict=True))
         distances = torch.stack(
             [_distance_ahead(cloth, episode, x, v) for x, v in zip(hypotheses, velocities, strict=True)]

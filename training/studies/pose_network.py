@@ -48,13 +48,13 @@ EPISODE_COUNT, FAST_EPISODE_COUNT = 16, 1
 FAST_SIZE = MovingSize(spacing=0.05, fit=7, rate=10.0, shrink=2)
 REGISTERED, SIMULATED, TRUE_START = "registered", "simulated", ("true shape at rest", "true shape in motion")
 ALONE, WITH_PREVIOUS, WITH_SIMULATION = "network", "network, frame before", "network + simulation"
-POINT_NOISE_STD_M = 4e-3  # that registration counts with
+REGISTRATION_NOISE_STD_M = 4e-3  # that registration counts with
 FORCE_MODES, FAST_FORCE_MODES = 6, 3
 FORCE_WINDOW_S = 0.25
 STIFFNESS_FACTOR, DRAG_STD_FRACTION = 2.0, 0.5  # how uncertain the nominal fabric is
 START_BULGE_M = 2e-3  # of the flat sheet that settles: a plane is a bifurcation
 SETTLE_S, SETTLE_RATE_PER_S = 1.5, 10.0
-HEADINGS = 24  # that are tried for a sheet in a single gripper
+HEADING_COUNT = 24  # that are tried for a sheet in a single gripper
 MANY_HIDDEN = 0.3  # share of the vertices
 WARM_UP_CALLS = 3
 MIN_CLOUD_POINTS = 20  # of a frame that the network looks at
@@ -190,29 +190,29 @@ def _read_facts(out: Path, seed: int) -> dict[str, Any]:
     return json.loads((out / "truth" / f"{seed:03d}.json").read_text())
 
 
-def with_first_state(held: HeldOut, x: Tensor, v: Tensor | None = None) -> Recording:
+def with_first_state(scene: HeldOut, x: Tensor, v: Tensor | None = None) -> Recording:
     """Return the recording on the cloth's mesh with a first shape [V, 3] m and, in motion, velocities [V, 3] m/s."""
-    mesh = held.cloth.mesh
+    mesh = scene.cloth.mesh
     info = replace(
-        held.recording.cloth,
+        scene.recording.cloth,
         vertices=np.asarray(mesh.vertices),
         faces=np.asarray(mesh.faces),
         uv=np.asarray(mesh.uv),
         initial_vertices=x.numpy(),
         initial_velocities=None if v is None else v.numpy(),
     )
-    return replace(held.recording, cloth=info)
+    return replace(scene.recording, cloth=info)
 
 
 # -- methods ----------------------------------------------------------------------------------------------------------
 
 
-def hanging_shape(held: HeldOut) -> Tensor:
+def hanging_shape(scene: HeldOut) -> Tensor:
     """Return the shape [V, 3] m of the sheet at rest in its grippers at the first frame, without the truth.
 
     The heading of a sheet in a single gripper is the one that is nearest to the first cloud.
     """
-    cloth, episode = held.cloth, identification.build_episode(held.cloth, held.recording, has_first_shape=False)
+    cloth, episode = scene.cloth, identification.build_episode(scene.cloth, scene.recording, has_first_shape=False)
     rest = rest_coordinates(cloth.mesh)
     first = next(k for k, cloud in enumerate(episode.clouds) if len(cloud))
     frame = build_scene_frame(pose_inputs(cloth, episode, first, rest))
@@ -227,7 +227,7 @@ def hanging_shape(held: HeldOut) -> Tensor:
         return state.x
     gripper = interpolate_poses(next(iter(episode.motion.values())), episode.times[:1])[0, :3, 3]
     faces, candidates = torch.as_tensor(cloth.mesh.faces), []
-    for angle in torch.arange(HEADINGS) * (2 * torch.pi / HEADINGS):
+    for angle in torch.arange(HEADING_COUNT) * (2 * torch.pi / HEADING_COUNT):
         c, s, one, zero = angle.cos(), angle.sin(), torch.ones(()), torch.zeros(())
         turn = torch.stack([c, -s, zero, s, c, zero, zero, zero, one]).reshape(3, 3).to(x)
         candidates.append(gripper + (state.x - gripper) @ turn.mT)
@@ -237,24 +237,24 @@ def hanging_shape(held: HeldOut) -> Tensor:
 
 def _simulated_case(load: Callable[[], HeldOut]) -> dict[str, Any]:
     """Compute the simulation that begins at rest, with the nominal fabric."""
-    held = load()
+    scene = load()
     began = time.process_time()
-    episode = identification.build_episode(held.cloth, with_first_state(held, hanging_shape(held)))
+    episode = identification.build_episode(scene.cloth, with_first_state(scene, hanging_shape(scene)))
     with torch.no_grad():
-        x = Replay(held.cloth)(episode).x
-    return score(x, held) | {"cpu_seconds": time.process_time() - began}
+        x = Replay(scene.cloth)(episode).x
+    return score(x, scene) | {"cpu_seconds": time.process_time() - began}
 
 
 def _registered_case(load: Callable[[], HeldOut]) -> dict[str, Any]:
     """Register every frame, the first one from the sheet at rest."""
-    held = load()
+    scene = load()
     began = time.process_time()
-    episode = identification.build_episode(held.cloth, with_first_state(held, hanging_shape(held)))
-    gripped, positions = carry_grips(held.cloth, episode)
+    episode = identification.build_episode(scene.cloth, with_first_state(scene, hanging_shape(scene)))
+    gripped, positions = carry_grips(scene.cloth, episode)
     twice = replace(episode, clouds=[episode.clouds[0], *episode.clouds])  # the first shape is registered, too
     positions = torch.cat([positions[:1], positions])
-    x = register_frames(twice, held.cloth.mesh, gripped, positions, POINT_NOISE_STD_M)[1:]
-    return score(x, held) | {"cpu_seconds": time.process_time() - began}
+    x = register_frames(twice, scene.cloth.mesh, gripped, positions, REGISTRATION_NOISE_STD_M)[1:]
+    return score(x, scene) | {"cpu_seconds": time.process_time() - began}
 
 
 def carry_grips(cloth: tc.Cloth, episode: Episode) -> tuple[Tensor, Tensor]:
@@ -271,12 +271,12 @@ def carry_grips(cloth: tc.Cloth, episode: Episode) -> tuple[Tensor, Tensor]:
 
 def _network_cases(load: Callable[[], HeldOut], path: Path) -> dict[str, Any]:
     """Compute what the network says of every frame, alone and from its estimate of the frame before."""
-    held, network = load(), load_network(path)
-    episode = identification.build_episode(held.cloth, held.recording, has_first_shape=False)
-    rest, out = rest_coordinates(held.cloth.mesh), {}
+    scene, network = load(), load_network(path)
+    episode = identification.build_episode(scene.cloth, scene.recording, has_first_shape=False)
+    rest, out = rest_coordinates(scene.cloth.mesh), {}
     for name, uses_previous in ((ALONE, False), (WITH_PREVIOUS, True)):
-        x, std, seconds = predict_frames(network, held.cloth, episode, rest, uses_previous)
-        out[name] = score(x, held, std[..., None].expand_as(x)) | {"ms_per_cloud": 1e3 * float(np.median(seconds))}
+        x, std, seconds = predict_frames(network, scene.cloth, episode, rest, uses_previous)
+        out[name] = score(x, scene, std[..., None].expand_as(x)) | {"ms_per_cloud": 1e3 * float(np.median(seconds))}
     return out
 
 
@@ -306,18 +306,18 @@ def predict_frames(
 
 
 def _smoothed_case(load: Callable[[], HeldOut], path: Path, fast: bool) -> dict[str, Any]:
-    held = load()
-    return _estimate(held, held.recording, fast, start=load_network(path))
+    scene = load()
+    return _estimate(scene, scene.recording, fast, start=load_network(path))
 
 
 def _true_start_case(load: Callable[[], HeldOut], moves: bool, fast: bool) -> dict[str, Any]:
-    held = load()
-    return _estimate(held, with_first_state(held, held.x[0], held.v[0] if moves else None), fast)
+    scene = load()
+    return _estimate(scene, with_first_state(scene, scene.x[0], scene.v[0] if moves else None), fast)
 
 
-def _estimate(held: HeldOut, recording: Recording, fast: bool, **options: Any) -> dict[str, Any]:
+def _estimate(scene: HeldOut, recording: Recording, fast: bool, **options: Any) -> dict[str, Any]:
     """Compute the smoother's estimate, whose fabric is known to a factor of 2."""
-    cloth = held.cloth
+    cloth = scene.cloth
     stiffness = float(cloth.get_submodule("material.youngs_modulus").value.detach())  # type: ignore[union-attr]
     drag = AirDrag.amplitudes["normal"].typical
     uncertain = {"youngs_modulus": (stiffness, STIFFNESS_FACTOR), "air.normal": (drag, DRAG_STD_FRACTION * drag)}
@@ -336,11 +336,11 @@ def _estimate(held: HeldOut, recording: Recording, fast: bool, **options: Any) -
     except (SimulationDiverged, TorchclothError) as error:
         return {"failed": str(error)}
     fit = {name: result.fit[name] for name in ("force_fraction", "converged", "unknowns")}
-    uncorrected = score(result.uncorrected, held)
-    start = score(result.uncorrected[:1], held)
+    uncorrected = score(result.uncorrected, scene)
+    start = score(result.uncorrected[:1], scene)
     seconds = {"cpu_seconds": time.process_time() - began}
     return (
-        score(result.x, held, result.std)
+        score(result.x, scene, result.std)
         | fit
         | seconds
         | {"rms_start": start["rms"], "rms_uncorrected": uncorrected["rms"]}
@@ -350,19 +350,19 @@ def _estimate(held: HeldOut, recording: Recording, fast: bool, **options: Any) -
 # -- scores -----------------------------------------------------------------------------------------------------------
 
 
-def score(x: Tensor, held: HeldOut, std: Tensor | None = None) -> dict[str, Any]:
+def score(x: Tensor, scene: HeldOut, std: Tensor | None = None) -> dict[str, Any]:
     """Return distances from the truth [m], and the coverage of standard deviations.
 
     Args:
         x: [T, V, 3] m, of all frames or the first ones.
-        held: the episode.
+        scene: the episode.
         std: [T, V, 3] m.
     """
-    episode = identification.build_episode(held.cloth, held.recording, has_first_shape=False)
+    episode = identification.build_episode(scene.cloth, scene.recording, has_first_shape=False)
     count = len(x)
-    squared = (x - held.x[:count]).square().sum(-1)
+    squared = (x - scene.x[:count]).square().sum(-1)
     clouds = replace(episode, clouds=episode.clouds[:count])
-    hidden = ~find_seen_vertices(held.x[:count], clouds, held.cloth.mesh)
+    hidden = ~find_seen_vertices(scene.x[:count], clouds, scene.cloth.mesh)
     per_frame, hidden_share = squared.mean(1).sqrt(), hidden.double().mean(1)
     much_hidden = per_frame[hidden_share >= MANY_HIDDEN]
     out = {
@@ -375,7 +375,7 @@ def score(x: Tensor, held: HeldOut, std: Tensor | None = None) -> dict[str, Any]
     if std is None:
         return out
     free = torch.ones(x.shape[1], dtype=torch.bool)
-    for part in held.cloth.boundaries.values():
+    for part in scene.cloth.boundaries.values():
         free[part.index] = False  # type: ignore[index]
-    inside = ((x - held.x[:count]).abs() < Z_95 * std).double()[:, free]
+    inside = ((x - scene.x[:count]).abs() < Z_95 * std).double()[:, free]
     return out | {"coverage": float(inside.mean()), "std_rms": float(std.square().sum(-1).mean().sqrt())}

@@ -14,7 +14,7 @@ from .fabric_tables import NO_VALUE, make_table
 from .hidden_rates import Rate
 
 Results = Mapping[int, Mapping[str, Any]]  # seed -> facts and methods
-BOOTSTRAP_DRAWS, BOOTSTRAP_SEED = 2000, 0
+MEDIAN_BOOTSTRAP_DRAWS, BOOTSTRAP_SEED = 2000, 0
 COMBINED_PREFIX = "network + simulation"
 METHOD_HEADINGS = (
     "method",
@@ -34,7 +34,7 @@ def bootstrap_median(values: Sequence[float]) -> tuple[float, float, float]:
     """Return the median and its 95 % percentile interval over the episodes."""
     numbers = np.asarray(values, dtype=float)
     rng = np.random.default_rng(BOOTSTRAP_SEED)
-    drawn = numbers[rng.integers(0, len(numbers), (BOOTSTRAP_DRAWS, len(numbers)))]
+    drawn = numbers[rng.integers(0, len(numbers), (MEDIAN_BOOTSTRAP_DRAWS, len(numbers)))]
     low, high = np.quantile(np.median(drawn, axis=1), [0.025, 0.975])
     return float(np.median(numbers)), float(low), float(high)
 

@@ -57,11 +57,11 @@ PATCH_SAMPLE_SPACING_M = 2e-3
 CLAMP_BAR_SIZE_M, CLAMP_BAR_HEIGHT_M = (0.02, 0.03), 0.01  # thickness and height; its middle above the edge
 DISTANCE_RATIO_RANGE = (0.97, 1.006)  # of the grippers, over the distance of what they hold
 TOP_EDGE_M = (0.50, 0.0)  # x and y of the middle of the grippers at rest
-CLEARANCE_M = 0.06  # of the lowest point of a hanging sheet above the table
+TABLE_CLEARANCE_M = 0.06  # of the lowest point of a hanging sheet above the table
 HEADING_RANGE_RAD, CORNER_OFFSET_M = 0.35, 0.10  # the one arm's corner lies to its side
 MOTION_S = 2.4
 START_RANGE_S, DURATION_RANGE_S = (0.5, 0.8), (1.0, 1.5)  # of the recording, in the motion
-FRAME_RATE_HZ = 30.0
+CAMERA_RATE_HZ = 30.0
 PARKED_TURN_RAD = 1.0  # of the first joint of an arm that holds nothing
 IK_ATTEMPTS = 20
 DISTANCE_RANGE_M = {"kinect": (1.0, 1.3), "realsense": (0.95, 1.2)}  # of the camera from the cloth
@@ -71,7 +71,7 @@ BAR_PLACE_FRACTION, BAR_LENGTH_M, BAR_TILT_STD_RAD = 0.6, 1.5, 0.2  # place: of 
 WALL_X_M, FLOOR_Z_M = -0.6, -0.75
 MAX_POINTS = 250
 # The rig's margins for the bias of the sensor, which moves the arms' points too.
-ROBOT_MARGIN_M, TABLE_MARGIN_M = {"kinect": 0.02, "realsense": 0.03}, 0.02
+ROBOT_MARGIN_M, SEGMENTED_TABLE_MARGIN_M = {"kinect": 0.02, "realsense": 0.03}, 0.02
 WORKSPACE_MARGIN_M = 0.05
 # The scale of a D435 is off by 2 % out of the box. The rig has corrected it on its own arms, to half a per cent.
 CALIBRATED_STEREO_NOISE = replace(observe.StereoNoise.d435(), bias_scale=0.005)
@@ -93,7 +93,7 @@ class MovingSize:
 
     spacing: float = 0.02
     fit: int = 13
-    rate: float = FRAME_RATE_HZ
+    rate: float = CAMERA_RATE_HZ
     shrink: int = 1
 
 
@@ -331,10 +331,10 @@ def _draw_path(rng: np.random.Generator, name: str, hold: _Hold) -> _Path:
     else:
         offset += rng.standard_normal((count, 3)) * [0.05, 0.05, 0.025]
         yaw += 0.2 * rng.standard_normal(count)
-    offset[:, 2] = np.maximum(offset[:, 2], -CLEARANCE_M / 2)
+    offset[:, 2] = np.maximum(offset[:, 2], -TABLE_CLEARANCE_M / 2)
     t = np.arange(round(MOTION_S / KNOT_PERIOD_S) + 1) * KNOT_PERIOD_S
     heading = rng.uniform(-HEADING_RANGE_RAD, HEADING_RANGE_RAD)
-    place = np.array([*TOP_EDGE_M, CLEARANCE_M + hold.height])
+    place = np.array([*TOP_EDGE_M, TABLE_CLEARANCE_M + hold.height])
     if len(hold.points) == 1:
         place[1] += CORNER_OFFSET_M
     path = minimum_jerk(t, knots, np.concatenate([np.zeros((1, 3)), offset]))
@@ -471,13 +471,13 @@ def _observe(
     grips = np.concatenate([pose[:, :3, 3] for pose in poses.values()])
     reach = float(np.hypot(sheet.width, sheet.height)) + WORKSPACE_MARGIN_M
     low, high = grips.min(0) - reach, grips.max(0) + reach
-    low[2], high[2] = TABLE_MARGIN_M, grips[:, 2].max() + WORKSPACE_MARGIN_M
+    low[2], high[2] = SEGMENTED_TABLE_MARGIN_M, grips[:, 2].max() + WORKSPACE_MARGIN_M
     stages = observe.Segmentation(
         workspace_low=tuple(low),
         workspace_high=tuple(high),
         robot_margin=ROBOT_MARGIN_M[name],
         table=(0.0, 0.0, 1.0, 0.0),
-        table_margin=TABLE_MARGIN_M,
+        table_margin=SEGMENTED_TABLE_MARGIN_M,
         isolation_radius=ISOLATION_RADIUS_M,
         isolation_neighbours=ISOLATION_NEIGHBOURS,
         grasp_distance=GRASP_DISTANCE_FRACTION * float(np.hypot(sheet.width, sheet.height)),
