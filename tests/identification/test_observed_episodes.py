@@ -58,7 +58,7 @@ def test_without_initial_vertices_the_mesh_is_the_first_frame(recording):
 
 def test_a_shape_that_is_to_be_estimated_may_be_far_from_the_grippers(recording, model):
     far = with_cloth(recording, initial_vertices=None)  # the mesh lies flat about the origin
-    with pytest.raises(InvalidInput, match="the held patch 1.05 m from its gripper"):
+    with pytest.raises(InvalidInput, match=r"the held patch 1\.05 m from its gripper"):
         build_episode(model, far)
     assert build_episode(model, far, has_first_shape=False).motion.keys() == recording.grippers.keys()
 

@@ -16,7 +16,7 @@ SHIPPED = "shipped"
 
 
 def add_network_option(parser: argparse.ArgumentParser) -> None:
-    """Add ``--network``."""
+    """Add the option ``--network`` to a verb's parser."""
     parser.add_argument(
         "--network",
         nargs="?",

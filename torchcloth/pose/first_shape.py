@@ -155,7 +155,7 @@ def pose_inputs(
 
 
 def find_grippers(cloth: Cloth, rest: Tensor) -> list[str]:
-    """Names of at most two grasps, those that are farthest apart on the fabric."""
+    """Return the names of at most two grasps, those that are farthest apart on the fabric."""
     names = [name for name, part in cloth.boundaries.items() if isinstance(part, Grasp)]
     if len(names) <= 2:
         return names

@@ -13,7 +13,7 @@ from ..recordings import Markers, Recording
 from .first_shape import pose_inputs, recorded_mesh, recorded_rest_coordinates
 from .network import PoseEstimator
 
-MIN_CLOUD_POINTS = 20  # of a frame that the network looks at
+MIN_POINTS_FOR_NETWORK = 20  # of a frame that the network looks at
 VERTICES_PER_MARKER = 6  # errors of neighbours are alike
 CLOUDS_IN_COMMON = 10  # successive clouds, and neighbours, that share an error count as one answer
 
@@ -40,7 +40,7 @@ def add_network_answers(cloth: Cloth, recording: Recording, network: PoseEstimat
     places, variances = np.full((len(episode.times), len(chosen), 3), np.nan), []
     with torch.no_grad():
         for frame, cloud in enumerate(episode.clouds):
-            if len(cloud) >= MIN_CLOUD_POINTS:
+            if len(cloud) >= MIN_POINTS_FOR_NETWORK:
                 answer = network(pose_inputs(cloth, episode, frame, rest, seed=frame))
                 places[frame] = answer.x[0, chosen].double().numpy()
                 variances.append(float(answer.std.square().mean()))

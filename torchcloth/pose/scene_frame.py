@@ -11,7 +11,7 @@ from torch import Tensor
 from ..meshes import Mesh
 
 MIN_GRIP_DISTANCE_M = 0.02  # of two grips along the cloth, and horizontally; nearer ones give no direction
-GRIP_STD_M, GRIP_LAG_STD_S = 2e-3, 0.010  # of a gripper's reported place, and of its time against the cloud's
+REPORTED_GRIP_STD_M, GRIP_LAG_STD_S = 2e-3, 0.010  # of a gripper's reported place, and of its time against the cloud's
 GRIP_REACH = 0.25  # of fabric that moves along with a held patch, in the scene's unit of length
 
 
@@ -159,7 +159,7 @@ def build_scene_frame(inputs: PoseInputs) -> SceneFrame:
     return SceneFrame(origin, axes, rest_origin, rest_axes, scale, spread, rise)
 
 
-def move_to_grippers(x: Tensor, std: Tensor, inputs: PoseInputs, grip_std: float = GRIP_STD_M) -> Tensor:
+def move_to_grippers(x: Tensor, std: Tensor, inputs: PoseInputs, grip_std: float = REPORTED_GRIP_STD_M) -> Tensor:
     """Return positions [B, V, 3] m, moved smoothly so that what is held comes nearer to its gripper.
 
     The robot says where its grippers are to ``grip_std`` [m], and earlier or later than the cloud by

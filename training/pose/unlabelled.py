@@ -13,13 +13,13 @@ from torchcloth._utils.files import write_atomically
 from torchcloth.boundaries.motion import interpolate_poses
 from torchcloth.errors import InvalidInput
 from torchcloth.pose.first_shape import find_grippers, pose_inputs, recorded_rest_coordinates
+from torchcloth.pose.network_answers import MIN_POINTS_FOR_NETWORK
 from torchcloth.recordings import Recording
 
 from .data import DATA_SCHEMA, MOTION_KNOT_PERIOD_S, motion_path
 from .scenes import FABRIC_RANGES, Fabric
 
 Array = np.ndarray
-MIN_CLOUD_POINTS = 20
 
 
 def write_unlabelled(folder: Path, recordings: Sequence[Recording]) -> int:
@@ -49,7 +49,7 @@ def make_unlabelled_motion(recording: Recording, number: int) -> dict[str, Array
     cloth = identification.build_cloth(recording)
     episode = identification.build_episode(cloth, recording, has_first_shape=False)
     rest = recorded_rest_coordinates(cloth, recording)
-    frames = [k for k, cloud in enumerate(episode.clouds) if len(cloud) >= MIN_CLOUD_POINTS]
+    frames = [k for k, cloud in enumerate(episode.clouds) if len(cloud) >= MIN_POINTS_FOR_NETWORK]
     seen = [pose_inputs(cloth, episode, frame, rest, seed=frame) for frame in frames]
     names = find_grippers(cloth, rest)
     first = max(float(episode.motion[name].t[0]) for name in names)

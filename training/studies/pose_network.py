@@ -34,6 +34,7 @@ from torchcloth.identification import Episode
 from torchcloth.losses import chamfer_to_surface
 from torchcloth.pose import PoseEstimator, estimate_pose, load_network, rest_coordinates
 from torchcloth.pose.first_shape import SHIPPED_NETWORK, pose_inputs
+from torchcloth.pose.network_answers import MIN_POINTS_FOR_NETWORK
 from torchcloth.pose.scene_frame import build_scene_frame
 from torchcloth.pose.visibility import find_seen_vertices
 from torchcloth.recordings import Recording
@@ -57,7 +58,6 @@ SETTLE_S, SETTLE_RATE_PER_S = 1.5, 10.0
 HEADING_COUNT = 24  # that are tried for a sheet in a single gripper
 MANY_HIDDEN = 0.3  # share of the vertices
 WARM_UP_CALLS = 3
-MIN_CLOUD_POINTS = 20  # of a frame that the network looks at
 
 
 class HeldOut(NamedTuple):
@@ -290,7 +290,7 @@ def predict_frames(
     x, std, seconds, previous = [], [], [], None
     with torch.no_grad():
         for t, cloud in enumerate(episode.clouds):
-            if len(cloud) < MIN_CLOUD_POINTS:
+            if len(cloud) < MIN_POINTS_FOR_NETWORK:
                 x.append(x[-1] if x else torch.full_like(rest, torch.nan))
                 std.append(std[-1] if std else torch.full_like(rest[:, 0], torch.nan))
                 continue
