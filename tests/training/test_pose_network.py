@@ -24,7 +24,7 @@ def folder(tmp_path_factory):
 
 
 @pytest.fixture(scope="module")
-def held(folder):
+def held_out(folder):
     """An episode of a sheet in two grippers, coarse in space and time."""
     with pytest.MonkeyPatch.context() as patch, twins.use_float64():
         patch.setattr(pose_network, "FAST_SIZE", TINY_SIZE)
@@ -39,56 +39,56 @@ def weights(folder):
     return folder / "tiny.safetensors"
 
 
-def test_a_recording_begins_in_motion_and_has_no_first_shape(held):
-    cloth = held.recording.cloth
+def test_a_recording_begins_in_motion_and_has_no_first_shape(held_out):
+    cloth = held_out.recording.cloth
     assert cloth.initial_vertices is None
     assert cloth.initial_velocities is None
-    assert float(held.v[0].norm(dim=-1).max()) > 0.05
-    assert held.recording.points.t[0] == held.recording.grippers["left"].t[0] == 0
+    assert float(held_out.v[0].norm(dim=-1).max()) > 0.05
+    assert held_out.recording.points.t[0] == held_out.recording.grippers["left"].t[0] == 0
 
 
-def test_the_points_are_the_cloths_though_nobody_said_which(held):
-    assert held.facts["foreign"] < 0.05
-    assert 0.1 < held.facts["occluded"] < 0.6
-    assert held.recording.points.counts.min() > 50
-    distance = torch.cdist(torch.as_tensor(held.recording.points.frame(0)), held.x[0]).amin(1)
+def test_the_points_are_the_cloths_though_nobody_said_which(held_out):
+    assert held_out.facts["foreign"] < 0.05
+    assert 0.1 < held_out.facts["occluded"] < 0.6
+    assert held_out.recording.points.counts.min() > 50
+    distance = torch.cdist(torch.as_tensor(held_out.recording.points.frame(0)), held_out.x[0]).amin(1)
     assert float(distance.median()) < 0.06
 
 
-def test_the_truth_is_at_the_vertices_that_the_grippers_hold(held):
-    for name, part in held.cloth.boundaries.items():
-        origin = torch.as_tensor(held.recording.grippers[name].position[0])
-        assert float((held.x[0, part.index].mean(0) - origin).norm()) < 0.04
+def test_the_truth_is_at_the_vertices_that_the_grippers_hold(held_out):
+    for name, part in held_out.cloth.boundaries.items():
+        origin = torch.as_tensor(held_out.recording.grippers[name].position[0])
+        assert float((held_out.x[0, part.index].mean(0) - origin).norm()) < 0.04
 
 
-def test_the_sheet_hangs_from_its_grippers_and_is_not_the_truth(held):
-    x = pose_network.hanging_shape(held)
-    error = (x - held.x[0]).square().sum(-1).mean().sqrt()
+def test_the_sheet_hangs_from_its_grippers_and_is_not_the_truth(held_out):
+    x = pose_network.hanging_shape(held_out)
+    error = (x - held_out.x[0]).square().sum(-1).mean().sqrt()
     assert 1e-3 < float(error) < 0.08
-    gripped = torch.cat([part.index for part in held.cloth.boundaries.values()])
-    assert float((x - held.x[0])[gripped].norm(dim=-1).max()) < 0.02
+    gripped = torch.cat([part.index for part in held_out.cloth.boundaries.values()])
+    assert float((x - held_out.x[0])[gripped].norm(dim=-1).max()) < 0.02
 
 
-def test_registration_comes_nearer_than_the_simulation_from_rest(held):
+def test_registration_comes_nearer_than_the_simulation_from_rest(held_out):
     simulated, registered = (
-        case(lambda: held) for case in (pose_network._simulated_case, pose_network._registered_case)
+        case(lambda: held_out) for case in (pose_network._simulated_case, pose_network._registered_case)
     )
     assert registered["rms"] < simulated["rms"] < 0.1
 
 
-def test_every_frame_has_an_estimate_and_its_time(held, weights):
-    case = pose_network._network_cases(lambda: held, weights)
+def test_every_frame_has_an_estimate_and_its_time(held_out, weights):
+    case = pose_network._network_cases(lambda: held_out, weights)
     for name in (pose_network.ALONE, pose_network.WITH_PREVIOUS):
         assert 0 < case[name]["rms"] < 1.0
         assert 0 <= case[name]["coverage"] <= 1
         assert 0 < case[name]["ms_per_cloud"] < 1000
 
 
-def test_a_frame_without_a_cloud_has_the_estimate_before(held, weights):
-    episode = identification.build_episode(held.cloth, held.recording, has_first_shape=False)
+def test_a_frame_without_a_cloud_has_the_estimate_before(held_out, weights):
+    episode = identification.build_episode(held_out.cloth, held_out.recording, has_first_shape=False)
     episode.clouds[1] = episode.clouds[1][:0]
-    network, rest = pose_network.load_network(weights), rest_coordinates(held.cloth.mesh)
-    x, _, seconds = pose_network.predict_frames(network, held.cloth, episode, rest, False)
+    network, rest = pose_network.load_network(weights), rest_coordinates(held_out.cloth.mesh)
+    x, _, seconds = pose_network.predict_frames(network, held_out.cloth, episode, rest, False)
     assert len(seconds) == len(x) - 1
     torch.testing.assert_close(x[1], x[0])
 

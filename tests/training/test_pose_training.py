@@ -15,6 +15,7 @@ import torch
 
 import torchcloth as tc
 from torchcloth import recordings
+from torchcloth._utils.torch_modes import default_dtype
 from torchcloth.pose.first_shape import load_network
 from torchcloth.pose.network import PoseEstimator, PoseNetworkConfig
 from torchcloth.training.pose import train
@@ -45,10 +46,8 @@ def batch(folder):
 
 @pytest.fixture
 def single_precision():
-    before = torch.get_default_dtype()
-    torch.set_default_dtype(torch.float32)
-    yield
-    torch.set_default_dtype(before)
+    with default_dtype(torch.float32):
+        yield
 
 
 @pytest.mark.usefixtures("single_precision")

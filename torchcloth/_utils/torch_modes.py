@@ -27,6 +27,17 @@ def disable_autocast() -> Iterator[None]:
 
 
 @contextmanager
+def default_dtype(dtype: torch.dtype) -> Iterator[None]:
+    """Set torch's default float type within the block."""
+    before = torch.get_default_dtype()
+    torch.set_default_dtype(dtype)
+    try:
+        yield
+    finally:
+        torch.set_default_dtype(before)
+
+
+@contextmanager
 def isolated_grad_mode() -> Iterator[None]:
     """Enable gradients within the block whatever mode the caller is in, and disable autocast."""
     with torch.inference_mode(False), torch.enable_grad(), disable_autocast():

@@ -199,7 +199,7 @@ def estimate_first_shape(
         RecordingError: no cloud at the first frame.
     """
     network = network or load_network()
-    bare = replace(recording, cloth=replace(recording.cloth, initial_vertices=None, initial_velocities=None))
+    bare = without_first_shape(recording)
     is_single = recording.points is not None and len(recording.points) == 1
     episode = build_episode(cloth, _with_second_cloud(bare) if is_single else bare, has_first_shape=False)
     rest = recorded_rest_coordinates(cloth, recording)
@@ -221,6 +221,11 @@ def estimate_first_shape(
         )
     best = int(distances.nan_to_num(torch.inf).argmin())
     return FirstShape(hypotheses[best], std[best], velocities[best], distances, weights)
+
+
+def without_first_shape(recording: Recording) -> Recording:
+    """Return the recording without its own first shape and velocities."""
+    return replace(recording, cloth=replace(recording.cloth, initial_vertices=None, initial_velocities=None))
 
 
 def _with_second_cloud(recording: Recording) -> Recording:

@@ -10,7 +10,7 @@ import torch
 from ..cloth import Cloth
 from ..episodes.observed import build_episode
 from ..recordings import Markers, Recording
-from .first_shape import pose_inputs, recorded_mesh, recorded_rest_coordinates
+from .first_shape import pose_inputs, recorded_mesh, recorded_rest_coordinates, without_first_shape
 from .network import PoseEstimator
 
 MIN_POINTS_FOR_NETWORK = 20  # of a frame that the network looks at
@@ -32,8 +32,7 @@ def add_network_answers(cloth: Cloth, recording: Recording, network: PoseEstimat
     Raises:
         InvalidInput: a cloth whose vertices have no single pattern coordinates.
     """
-    bare = replace(recording, cloth=replace(recording.cloth, initial_vertices=None, initial_velocities=None))
-    episode = build_episode(cloth, bare, has_first_shape=False)
+    episode = build_episode(cloth, without_first_shape(recording), has_first_shape=False)
     rest, uv = recorded_rest_coordinates(cloth, recording), recorded_mesh(cloth, recording).uv
     assert uv is not None
     chosen = np.arange(0, len(rest), VERTICES_PER_MARKER)

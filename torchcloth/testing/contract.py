@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from abc import ABC
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
+from contextlib import AbstractContextManager
 from typing import Any
 
 import torch
 from torch import Tensor, nn
 from torch.func import functional_call
+
+from .._utils.torch_modes import default_dtype
 
 
 class Contract(ABC):  # noqa: B024 - what is abstract differs between the contracts
@@ -29,15 +31,9 @@ class Contract(ABC):  # noqa: B024 - what is abstract differs between the contra
                 getattr(self, name)()
 
 
-@contextmanager
-def float64() -> Iterator[None]:
-    """Set the default precision to float64 within the block, so that parts are float64 from the start."""
-    before = torch.get_default_dtype()
-    torch.set_default_dtype(torch.float64)
-    try:
-        yield
-    finally:
-        torch.set_default_dtype(before)
+def float64() -> AbstractContextManager[None]:
+    """Return a context whose default precision is float64, so that parts are float64 from the start."""
+    return default_dtype(torch.float64)
 
 
 class _Caller(nn.Module):

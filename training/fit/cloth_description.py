@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager
 from dataclasses import asdict
 from typing import Any
 
@@ -12,6 +11,7 @@ import torch
 from torch import Tensor
 
 from torchcloth import Cloth, Contact
+from torchcloth._utils.torch_modes import default_dtype
 from torchcloth.episodes.unknowns import find_scalar_parameters
 from torchcloth.errors import InvalidInput
 from torchcloth.identification import build_cloth
@@ -19,7 +19,7 @@ from torchcloth.recordings import ClothInfo, Collider, GraspInfo, Recording
 
 from .config import Model
 
-EPISODE_ONLY_FIELDS = {"extra", "initial_vertices"}
+EPISODE_ONLY_FIELDS = {"extra", "initial_vertices", "initial_velocities"}
 
 
 def describe_cloth(recording: Recording) -> dict[str, Any]:
@@ -66,15 +66,9 @@ def same_cloth(first: dict[str, Any], other: dict[str, Any]) -> bool:
     return _equal(first, second)
 
 
-@contextmanager
-def default_precision(name: str) -> Iterator[None]:
-    """Set torch's default float type, "float64" or "float32", within a context."""
-    before = torch.get_default_dtype()
-    torch.set_default_dtype(getattr(torch, name))
-    try:
-        yield
-    finally:
-        torch.set_default_dtype(before)
+def default_precision(name: str) -> AbstractContextManager[None]:
+    """Return a context in which torch's default float type is "float64" or "float32"."""
+    return default_dtype(getattr(torch, name))
 
 
 def _to_plain(part: Any) -> dict[str, Any]:

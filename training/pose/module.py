@@ -10,11 +10,11 @@ import lightning.pytorch as pl
 import torch
 from torch import Tensor
 
+from torchcloth._utils.constants import Z_95
 from torchcloth.pose.network import (
     MEAN_LOG_FABRIC,
     STD_LOG_FABRIC,
     PoseEstimator,
-    PoseNetworkConfig,
     StageOutputs,
     masked_mean,
 )
@@ -98,7 +98,7 @@ class PoseTraining(pl.LightningModule):
         prediction = self.network(batch.inputs)
         exists, error = batch.inputs.exists, prediction.x - batch.x
         rms = masked_mean(error.square().sum(-1), exists).sqrt()
-        inside = (error.abs() < 1.96 * prediction.std[..., None]).to(error).mean(-1)
+        inside = (error.abs() < Z_95 * prediction.std[..., None]).to(error).mean(-1)
         self.log("val/median_rms_mm", 1e3 * rms.median(), batch_size=len(rms), sync_dist=True)
         self.log("val/rms_mm", 1e3 * rms.mean(), batch_size=len(rms), sync_dist=True)
         self.log("val/coverage", masked_mean(inside, exists).mean(), batch_size=len(rms), sync_dist=True)
@@ -176,8 +176,3 @@ def _fabric_likelihood(outputs: StageOutputs, log_fabric: Tensor, has_truth: Ten
     squared = (outputs.log_fabric - (log_fabric - mean) / spread).square()
     likelihood = outputs.log_fabric_log_std + 0.5 * squared * (-2 * outputs.log_fabric_log_std).exp()
     return (likelihood.mean(-1) * has_truth).mean()
-
-
-def build_network(description: dict[str, int]) -> PoseEstimator:
-    """Return a new network of a stored size."""
-    return PoseEstimator(PoseNetworkConfig(**description))

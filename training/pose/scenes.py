@@ -10,8 +10,8 @@ from __future__ import annotations
 
 import math
 import warnings
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from functools import lru_cache
 from typing import Literal, NamedTuple, get_args
 
@@ -22,6 +22,7 @@ from scipy.spatial.transform import Rotation
 
 import torchcloth as tc
 from torchcloth import meshes
+from torchcloth._utils.torch_modes import default_dtype
 from torchcloth.boundaries import AbstractBoundary, Grasp, Plane
 from torchcloth.effects import AbstractEffect, AirDrag, Bending, Gravity
 from torchcloth.episodes.pattern_interpolation import interpolation_weights
@@ -230,7 +231,7 @@ def simulate(scene: Scene) -> SimulatedScene:
     shape = scene.shape
     times = POSE_FRAME_PERIOD_S * np.arange(int(scene.duration / POSE_FRAME_PERIOD_S + 1e-6) + 1)
     try:
-        with warnings.catch_warnings(), _single_precision():
+        with warnings.catch_warnings(), default_dtype(torch.float32):  # a scene is a function of its seed
             warnings.filterwarnings("ignore", "settle: after")  # the motion goes on from whatever shape it has
             cloth = build_cloth(shape.true_mesh, scene.fabric, shape.true_grips, scene.has_table)
             state = cloth.state(torch.as_tensor(scene.start, dtype=torch.float32))
@@ -244,17 +245,6 @@ def simulate(scene: Scene) -> SimulatedScene:
     if shape.weights is None:
         return SimulatedScene(scene, times, true_x, true_x, true_v)
     return SimulatedScene(scene, times, true_x, shape.weights @ true_x, shape.weights @ true_v)
-
-
-@contextmanager
-def _single_precision() -> Iterator[None]:
-    """Set the default precision, whatever the caller's: a scene is a function of its seed."""
-    before = torch.get_default_dtype()
-    torch.set_default_dtype(torch.float32)
-    try:
-        yield
-    finally:
-        torch.set_default_dtype(before)
 
 
 def _check_shapes(scene: Scene, x: Array) -> None:

@@ -134,17 +134,37 @@ def max_stable_step(spec: SheetSpec) -> float:
     return STEP_SAFETY_FACTOR * 2 / omega * (np.sqrt(1 + zeta**2) - zeta)
 
 
-def flex_xml(spec: SheetSpec, dt: float) -> str:
-    """Return the sheet, flat in the plane z = 0, as a MuJoCo model with time step ``dt`` s."""
-    _, faces = sheet_mesh(spec)
-    points = " ".join(f"{u:.17g} {v:.17g} 0" for u, v in rest_positions(spec))
+def flex_xml(
+    rest: Array,
+    faces: Array,
+    dt: float,
+    *,
+    membrane_stiffness: float,
+    poisson_ratio: float,
+    bending_stiffness: float,
+    damping_time: float,
+    gravity: float,
+) -> str:
+    """Return a cloth as a MuJoCo model.
+
+    Args:
+        rest: [V, 3] m, vertices of the unstrained cloth.
+        faces: [F, 3].
+        dt: time step [s].
+        membrane_stiffness: N/m.
+        poisson_ratio: -.
+        bending_stiffness: N m; 0: none.
+        damping_time: s.
+        gravity: m/s^2, along z.
+    """
+    points = " ".join(f"{value:.17g}" for value in rest.ravel())
     elements = " ".join(map(str, faces.ravel()))
-    bends = spec.bending_stiffness > 0
+    bends = bending_stiffness > 0
     # the thickness and modulus that give both stiffnesses: Y = E t, D = E t^3 / (12 (1 - nu^2))
-    plate = 12 * (1 - spec.poisson_ratio**2) * spec.bending_stiffness
-    t = np.sqrt(plate / spec.membrane_stiffness) if bends else 1e-3
+    plate = 12 * (1 - poisson_ratio**2) * bending_stiffness
+    t = np.sqrt(plate / membrane_stiffness) if bends else 1e-3
     return f"""<mujoco>
-      <option timestep="{dt:.17g}" integrator="Euler" gravity="0 0 {spec.gravity}">
+      <option timestep="{dt:.17g}" integrator="Euler" gravity="0 0 {gravity}">
         <flag contact="disable" constraint="disable"/>
       </option>
       <size memory="64M"/>
@@ -152,8 +172,8 @@ def flex_xml(spec: SheetSpec, dt: float) -> str:
         <flexcomp name="cloth" type="direct" dim="2" dof="full" mass="1" radius="0.001"
           point="{points}" element="{elements}">
           <contact selfcollide="none" contype="0" conaffinity="0"/>
-          <elasticity young="{spec.membrane_stiffness / t:.17g}" poisson="{spec.poisson_ratio}" thickness="{t:.17g}"
-            damping="{spec.damping_time}" elastic2d="{"both" if bends else "stretch"}"/>
+          <elasticity young="{membrane_stiffness / t:.17g}" poisson="{poisson_ratio}" thickness="{t:.17g}"
+            damping="{damping_time}" elastic2d="{"both" if bends else "stretch"}"/>
         </flexcomp>
       </worldbody>
     </mujoco>"""

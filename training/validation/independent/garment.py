@@ -11,7 +11,7 @@ from torchcloth._utils.constants import STANDARD_AIR_DENSITY_KG_PER_M3, STANDARD
 from torchcloth.errors import InvalidInput
 
 from . import mujoco_cloth
-from .flex_sheet import STEP_SAFETY_FACTOR, StillAir
+from .flex_sheet import STEP_SAFETY_FACTOR, StillAir, flex_xml
 from .mujoco_cloth import Grip, MujocoCloth, hold_grips
 
 Array = np.ndarray
@@ -88,7 +88,18 @@ class MujocoGarment(MujocoCloth):
         mujoco = mujoco_cloth.mujoco
         self.spec, self.dt = spec, step_fraction * spec.max_stable_step  # pyright: ignore[reportAttributeAccessIssue] - gravity is read
         self.faces, self.mass = spec.faces, spec.masses
-        self.model = mujoco.MjModel.from_xml_string(_flex_xml(spec, self.dt))
+        self.model = mujoco.MjModel.from_xml_string(
+            flex_xml(
+                spec.rest,
+                spec.faces,
+                self.dt,
+                membrane_stiffness=spec.membrane_stiffness,
+                poisson_ratio=spec.poisson_ratio,
+                bending_stiffness=spec.bending_stiffness,
+                damping_time=spec.damping_time,
+                gravity=spec.gravity,
+            )
+        )
         if self.model.nv != 3 * len(spec.rest):
             raise InvalidInput("the flex's degrees of freedom", got=self.model.nv, expected=str(3 * len(spec.rest)))
         self.model.body_mass[1:] = self.mass
@@ -113,24 +124,3 @@ def simulate_garment(
     x = garment.run(x0, settling, hold_grips(grips), damping_rate=SETTLING_DAMPING_PER_S).x[-1]
     begin = {name: replace(grip, t=grip.t - times[0]) for name, grip in grips.items()}
     return garment.run(x, np.array([0.0, times[-1] - times[0]]), begin).x[-1]
-
-
-def _flex_xml(spec: GarmentSpec, dt: float) -> str:
-    points = " ".join(f"{value:.17g}" for value in spec.rest.ravel())
-    elements = " ".join(map(str, spec.faces.ravel()))
-    plate = 12 * (1 - spec.poisson_ratio**2) * spec.bending_stiffness
-    thickness = np.sqrt(plate / spec.membrane_stiffness)
-    return f"""<mujoco>
-      <option timestep="{dt:.17g}" integrator="Euler" gravity="0 0 {spec.gravity}">
-        <flag contact="disable" constraint="disable"/>
-      </option>
-      <size memory="64M"/>
-      <worldbody>
-        <flexcomp name="cloth" type="direct" dim="2" dof="full" mass="1" radius="0.001"
-          point="{points}" element="{elements}">
-          <contact selfcollide="none" contype="0" conaffinity="0"/>
-          <elasticity young="{spec.membrane_stiffness / thickness:.17g}" poisson="{spec.poisson_ratio}"
-            thickness="{thickness:.17g}" damping="{spec.damping_time}" elastic2d="both"/>
-        </flexcomp>
-      </worldbody>
-    </mujoco>"""

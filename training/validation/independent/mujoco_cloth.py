@@ -183,7 +183,19 @@ class MujocoCloth:
         self.dt = float(dt if dt is not None else max_stable_step(spec))
         self.uv, self.faces = sheet_mesh(spec)
         self.mass = vertex_masses(spec)
-        self.model = mujoco.MjModel.from_xml_string(flex_xml(spec, self.dt))
+        rest = np.pad(rest_positions(spec), ((0, 0), (0, 1)))  # flat in the plane z = 0
+        self.model = mujoco.MjModel.from_xml_string(
+            flex_xml(
+                rest,
+                self.faces,
+                self.dt,
+                membrane_stiffness=spec.membrane_stiffness,
+                poisson_ratio=spec.poisson_ratio,
+                bending_stiffness=spec.bending_stiffness,
+                damping_time=spec.damping_time,
+                gravity=spec.gravity,
+            )
+        )
         if self.model.nv != 3 * len(self.uv):
             raise InvalidInput("the flex's degrees of freedom", got=self.model.nv, expected=str(3 * len(self.uv)))
         self.model.body_mass[1:] = self.mass  # flexcomp gives all points the same mass; the rim must have less
