@@ -550,7 +550,6 @@ def test_a_urdf_beside_the_scene_goes_into_the_episode(copy, tmp_path):
     ("name", "part", "match"),
     [
         ("tum", "rgb.txt", "a TUM RGB-D folder needs rgb.txt beside depth.txt; or build the episode in Python"),
-        ("redwood", "color", "Redwood RGB-D folder needs a folder color or rgb or image beside depth"),
         (
             "redwood",
             "camera_intrinsic.json",
@@ -563,6 +562,20 @@ def test_a_folder_that_lacks_a_part_says_which(copy, name, part, match):
     path = truth.path / part
     shutil.rmtree(path) if path.is_dir() else path.unlink()
     refuse(truth, f"of no known format; .*{match}")
+
+
+@pytest.mark.parametrize(("name", "parts"), [("tum", ["rgb.txt", "rgb"]), ("redwood", ["color"])])
+def test_a_folder_without_colour_is_read(copy, name, parts):
+    truth = copy(name)
+    whole = formats.read(truth.path, scene=truth.write_scene()).cameras["cam0"]
+    for path in [truth.path / part for part in parts]:
+        shutil.rmtree(path) if path.is_dir() else path.unlink()
+    camera = formats.read(truth.path, scene=truth.write_scene()).cameras["cam0"]
+    assert camera.color is None
+    np.testing.assert_allclose(camera.depth.t, whole.depth.t - whole.depth.t[0], atol=1e-9)
+    np.testing.assert_array_equal(camera.T_world_camera, whole.T_world_camera)
+    for i, expected in enumerate(truth.images["cam0/depth"]):
+        np.testing.assert_array_equal(camera.depth.load(i), expected)
 
 
 def test_a_folder_of_point_clouds_says_what_to_do(tmp_path):

@@ -1,6 +1,6 @@
 """RGB-D folders in the layout of Open3D and the Redwood data sets.
 
-    color/*.jpg|png  depth/*.png  camera_intrinsic.json|intrinsic.json  [trajectory.log]
+    [color/*.jpg|png]  depth/*.png  camera_intrinsic.json|intrinsic.json  [trajectory.log]
 
 The intrinsic matrix in Open3D's JSON is stored column by column. The poses in a ``.log`` are camera-to-world, of a
 camera in the OpenCV convention. Depth is in millimetres unless the file says otherwise. Times are in the names of
@@ -50,24 +50,15 @@ _STAMPED_NAME_PATTERN = re.compile(r"\d+-(\d{6,15})")
 
 
 def matches(path: Path) -> bool:
-    """Return whether a folder has this layout."""
-    return (
-        _has_folder(path, "depth")
-        and any(_has_folder(path, name) for name in COLOR_FOLDERS)
-        and any(is_present(path / name) for name in INTRINSIC_FILES)
-    )
+    """Return whether a folder has this layout, with or without colour."""
+    return _has_folder(path, "depth") and any(is_present(path / name) for name in INTRINSIC_FILES)
 
 
 def describe_missing(path: Path) -> str:
     """Return what a folder lacks that has a folder of depth images."""
     if not _has_folder(path, "depth") or any(is_present(path / name) for name in ("rgb.txt", "depth.txt")):
         return ""
-    parts = {
-        f"a folder {' or '.join(COLOR_FOLDERS)}": any(_has_folder(path, name) for name in COLOR_FOLDERS),
-        " or ".join(INTRINSIC_FILES): any(is_present(path / name) for name in INTRINSIC_FILES),
-    }
-    missing = [what for what, is_there in parts.items() if not is_there]
-    return f"an Open3D/Redwood RGB-D folder needs {' and '.join(missing)} beside depth" if missing else ""
+    return "" if matches(path) else f"an Open3D/Redwood RGB-D folder needs {' or '.join(INTRINSIC_FILES)} beside depth"
 
 
 def _has_folder(path: Path, name: str) -> bool:
@@ -91,38 +82,44 @@ def read(path: Path, scene: SceneFile, episode: int | None) -> Imported:
     reject_unknown_keys(source)
     camera, fps = _camera(path, fps)
     camera.calibration.setdefault("depth_scale", scene.depth_scale(name) or REDWOOD_DEPTH_SCALE_M)
-    color = _images(path / next(n for n in COLOR_FOLDERS if _has_folder(path, n)), (".jpg", ".jpeg", ".png"))
     depth = _images(path / "depth", (".png",))
-    if len(color) != len(depth):
-        got = f"{len(color)} colour and {len(depth)} depth images"
-        raise RecordingError(f"{path} is not made of pairs", got=got, expected="as many of each")
-    times = {"color": _times(color, fps), "depth": _times(depth, fps)}
-    apart = np.abs(times["color"] - times["depth"])
-    if apart.max() > MAX_PAIR_DELAY_NS:
-        name_of_worst = color[int(apart.argmax())].name
-        got = f"{apart.max() / NANOSECONDS_PER_SECOND:.3g} s between {name_of_worst} and its depth image"
-        raise RecordingError(
-            f"{path} is not made of pairs",
-            got=got,
-            expected=f"at most {MAX_PAIR_DELAY_NS / NANOSECONDS_PER_SECOND:g} s",
-        )
+    images: dict[ImageKind, list[Path]] = {"depth": depth}
+    color_folder = next((n for n in COLOR_FOLDERS if _has_folder(path, n)), None)
+    if color_folder is not None:
+        images["color"] = _images(path / color_folder, (".jpg", ".jpeg", ".png"))
+    times = {kind: _times(paths, fps) for kind, paths in images.items()}
+    if "color" in images:
+        _check_pairs(path, images["color"], times["color"], times["depth"])
     start = int(min(t[0] for t in times.values()))
     size = camera.calibration["width"], camera.calibration["height"]
-    kinds: dict[ImageKind, list[Path]] = {"depth": depth, "color": color}
-    for kind, paths in kinds.items():
+    for kind, paths in images.items():
         numbers = np.arange(len(paths))
         stream = ImageStream(kind, numbers, to_seconds(times[kind], start), (), size, FileImages(paths))
         camera.streams[kind] = stream
     if image_size(depth[0]) != size:
         raise RecordingError(f"{depth[0]} has the wrong size", got=image_size(depth[0]), expected=f"{size}")
     check_depth_scale(camera.streams["depth"], camera.calibration["depth_scale"], depth[0], is_assumed=False)
-    imported = Imported(
-        cameras={name: camera}, notes={"format": REDWOOD_NAME, "start_ns": start, "unchecked": REDWOOD_UNCHECKED}
-    )
+    notes: dict[str, Any] = {"format": REDWOOD_NAME, "start_ns": start, "unchecked": REDWOOD_UNCHECKED}
+    if color_folder is None:
+        notes["repairs"] = [f"depth only: there is no folder {' or '.join(COLOR_FOLDERS)}"]
+    imported = Imported(cameras={name: camera}, notes=notes)
     log = next((path / n for n in TRAJECTORY_FILES if is_present(path / n)), None)
     if log is not None:
         camera.calibration["T_world_camera"] = require_fixed_pose(_poses(log, len(depth)), str(log))
     return imported
+
+
+def _check_pairs(path: Path, color: list[Path], color_ns: np.ndarray, depth_ns: np.ndarray) -> None:
+    """Refuse images that are not pairs of colour and depth."""
+    what = f"{path} is not made of pairs"
+    if len(color_ns) != len(depth_ns):
+        got = f"{len(color_ns)} colour and {len(depth_ns)} depth images"
+        raise RecordingError(what, got=got, expected="as many of each")
+    apart = np.abs(color_ns - depth_ns)
+    if apart.max() > MAX_PAIR_DELAY_NS:
+        name_of_worst = color[int(apart.argmax())].name
+        got = f"{apart.max() / NANOSECONDS_PER_SECOND:.3g} s between {name_of_worst} and its depth image"
+        raise RecordingError(what, got=got, expected=f"at most {MAX_PAIR_DELAY_NS / NANOSECONDS_PER_SECOND:g} s")
 
 
 def _camera(path: Path, fps: float | None) -> tuple[ImportedCamera, float | None]:

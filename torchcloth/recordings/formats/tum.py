@@ -6,7 +6,8 @@
 Lines with ``#`` are comments. Depth is in 1/5000 m, unless the scene says otherwise (many
 tools write millimetres: ``depth_scale`` 0.001). Colour and depth have separate
 clock ticks: a colour and a depth image that are each other's nearest within 20 ms share a frame number, and every other
-image has its own. The layout holds no intrinsics: the scene gives them. ``"source": {"trajectory": "left", "closed":
+image has its own. A folder with neither ``rgb.txt`` nor a folder ``rgb`` holds depth only. The layout holds no
+intrinsics: the scene gives them. ``"source": {"trajectory": "left", "closed":
 true}`` reads groundtruth.txt as the path of the gripper "left" instead, for those who track the hand.
 
 Text carries no checksum: a changed digit that stays plausible goes unnoticed, and so do changed bytes in the pixels of
@@ -47,18 +48,23 @@ TUM_CAMERA_NAME = "cam0"
 TUM_UNCHECKED = "times, poses, and pixels of JPEG images"
 TUM_DEPTH_SCALE_M = 1 / 5000  # per unit, by definition of the layout
 IMAGE_LIST_FILES: dict[ImageKind, str] = {"color": "rgb.txt", "depth": "depth.txt"}
+COLOR_FOLDER = "rgb"
 GROUND_TRUTH_FILE = "groundtruth.txt"
 
 
 def matches(path: Path) -> bool:
-    """Return whether a folder has this layout."""
-    return all(is_present(path / file) for file in IMAGE_LIST_FILES.values())
+    """Return whether a folder has this layout, with or without colour."""
+    return is_present(path / IMAGE_LIST_FILES["depth"]) and not describe_missing(path)
 
 
 def describe_missing(path: Path) -> str:
-    """Return which image list a folder lacks that has another one."""
-    present = [file for file in IMAGE_LIST_FILES.values() if path.is_dir() and is_present(path / file)]
+    """Return which image list a folder lacks that has another one; without colour images it needs no list of them."""
+    if not path.is_dir():
+        return ""
+    present = [file for file in IMAGE_LIST_FILES.values() if is_present(path / file)]
     missing = sorted(set(IMAGE_LIST_FILES.values()) - set(present))
+    if missing == [IMAGE_LIST_FILES["color"]] and not is_present(path / COLOR_FOLDER):
+        return ""
     return f"a TUM RGB-D folder needs {' and '.join(missing)} beside {present[0]}" if present and missing else ""
 
 
@@ -79,15 +85,16 @@ def read(path: Path, scene: SceneFile, episode: int | None) -> Imported:
     closed = source.optional(source.take, "closed") if hand is not None else None
     reject_unknown_keys(source)
     lists: dict[ImageKind, list[tuple[int, Path]]] = {
-        kind: _list(path, file) for kind, file in IMAGE_LIST_FILES.items()
+        kind: _list(path, file) for kind, file in IMAGE_LIST_FILES.items() if is_present(path / file)
     }
     stamps: dict[ImageKind, np.ndarray] = {
         kind: np.array([ns for ns, _ in rows], dtype=np.int64) for kind, rows in lists.items()
     }
     truth = _truth(path / GROUND_TRUTH_FILE) if is_present(path / GROUND_TRUTH_FILE) else None
     start = int(min(t[0] for t in stamps.values()))
-    numbers: dict[ImageKind, np.ndarray] = {}
-    numbers["color"], numbers["depth"] = pair_frames(stamps["color"], stamps["depth"])
+    numbers: dict[ImageKind, np.ndarray] = {"depth": np.arange(len(stamps["depth"]))}
+    if "color" in stamps:
+        numbers["color"], numbers["depth"] = pair_frames(stamps["color"], stamps["depth"])
     size = image_size(lists["depth"][0][1])
     stated_scale = scene.depth_scale(name)
     scale = stated_scale or TUM_DEPTH_SCALE_M
