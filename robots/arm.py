@@ -3,20 +3,24 @@
 from __future__ import annotations
 
 import math
+import warnings
+from functools import cached_property
 from pathlib import Path
 from typing import NamedTuple
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from torchcloth._utils.torch_modes import disable_autocast
 from torchcloth._utils.vectors import check_is_not_half
-from torchcloth.errors import InvalidInput
+from torchcloth.errors import InvalidInput, TorchclothError
 from torchcloth.types import Trajectory
 
 from . import inverse, trajectories
 from .chain import SerialChain
 from .description import Description, list_models, locate_urdf, read_description
+from .link_meshes import MeshShape, read_link_mesh
 from .rigid import check_rigid
 
 # Flexiv's own home posture (flange pointing down), the same for every Rizon; it is no part of a URDF.
@@ -27,16 +31,18 @@ class Primitive(NamedTuple):
     """A solid of the arm, for drawings, clearance and occlusion.
 
     Attributes:
-        kind: "box", "cylinder" or "sphere".
-        size: m; box: edges x, y, z; cylinder: radius, length along z; sphere: radius.
-        pose: [..., 4, 4] m, its centre in the world.
+        kind: "box", "cylinder", "sphere" or "mesh".
+        size: m; box: edges x, y, z; cylinder: radius, length along z; sphere: radius; mesh: extents along x, y, z.
+        pose: [..., 4, 4] m, its centre in the world; of a mesh, the origin of its vertices.
         link: name of the link that it belongs to.
+        mesh: vertices [V, 3] m and triangles [F, 3] of a closed surface, of a mesh only.
     """
 
     kind: str
     size: tuple[float, ...]
     pose: Tensor
     link: str
+    mesh: tuple[np.ndarray, np.ndarray] | None = None
 
 
 def load(
@@ -97,25 +103,43 @@ class Arm(SerialChain):
         root = torch.eye(4, dtype=torch.float64) if base is None else _validate_base(base, dtype)
         super().__init__(description, root, dtype)
         self.model, self.frame = model or description.name, frame
-        self._shapes, self._links_without_primitives = description.shapes, description.links_without_primitives
+        self._shapes, self._mesh_shapes, self._folder = description.shapes, description.mesh_shapes, description.folder
         joints = len(self.joint_names)  # fewer than the vendor's if the frame is not the last link
         posture = torch.tensor((home or [0.0] * joints)[:joints], dtype=torch.float64)
         buffers = {
             "home": posture.clamp(description.limits[2], description.limits[3]),
-            "_shape_pose": torch.stack([torch.eye(4, dtype=torch.float64), *(s.pose for s in self._shapes)])[1:],
+            "_shape_pose": torch.stack(
+                [torch.eye(4, dtype=torch.float64), *(s.pose for s in (*self._shapes, *self._mesh_shapes))]
+            )[1:],
         }
         for key, value in buffers.items():
             self.register_buffer(key, value.to(dtype), persistent=False)
 
     @property
     def solid_joints(self) -> tuple[int, ...]:
-        """Numbers of the joints that move the solids of ``geometry``, counted from 1; 0 for solids of the root."""
+        """Numbers of the joints that move the primitive solids, counted from 1; 0 for solids of the root."""
         return tuple(shape.body for shape in self._shapes)
 
     @property
     def links_without_primitives(self) -> tuple[str, ...]:
-        """Names of the links whose solids are meshes only, which ``geometry`` leaves out."""
-        return self._links_without_primitives
+        """Names of the links with a solid that is a mesh, whose distances to others are not computed."""
+        return tuple(dict.fromkeys(shape.link for shape in self._mesh_shapes))
+
+    @property
+    def unread_meshes(self) -> dict[str, str]:
+        """By link, why the mesh of a solid cannot be read; ``geometry`` leaves such solids out."""
+        return self._link_meshes[1]
+
+    @cached_property
+    def _link_meshes(self) -> tuple[list[tuple[int, MeshShape, tuple[np.ndarray, np.ndarray]]], dict[str, str]]:
+        """Meshes that could be read with their numbers, and why others could not, by link."""
+        meshes, faults = [], {}
+        for number, shape in enumerate(self._mesh_shapes):
+            try:
+                meshes.append((number, shape, read_link_mesh(shape.file, self._folder, shape.scale)))
+            except TorchclothError as error:
+                faults.setdefault(shape.link, str(error))
+        return meshes, faults
 
     def extra_repr(self) -> str:
         """Return name, frame and joints, for ``print(arm)``."""
@@ -237,19 +261,27 @@ class Arm(SerialChain):
 
     @disable_autocast()
     def geometry(self, q: Tensor) -> list[Primitive]:
-        """Return the boxes, cylinders and spheres of the links from the root to ``frame``.
+        """Return the boxes, cylinders, spheres and meshes of the links from the root to ``frame``.
 
-        A link gives its collision shapes, or its visual ones if it has no others; meshes are left out. With
+        A link gives its collision shapes, or its visual ones if it has no others. A mesh that is not closed is replaced
+        by its convex hull. A mesh that cannot be read is left out with a warning (``unread_meshes`` says why). With
         ``frame="tcp_closed"`` the gripper of a Rizon is included.
 
         Args:
             q: ``[..., J]`` rad or m, joint positions.
         """
         bodies = self.body_poses(q)
-        return [
+        solids = [
             Primitive(shape.kind, shape.size, bodies[..., shape.body, :, :] @ pose, shape.link)
-            for shape, pose in zip(self._shapes, self._shape_pose, strict=True)
+            for shape, pose in zip(self._shapes, self._shape_pose, strict=False)
         ]
+        meshes, faults = self._link_meshes
+        for link, reason in faults.items():
+            warnings.warn(f"solid of {link!r} is left out: {reason}", stacklevel=2)
+        for number, shape, mesh in meshes:
+            pose = bodies[..., shape.body, :, :] @ self._shape_pose[len(self._shapes) + number]
+            solids.append(Primitive("mesh", tuple(np.ptp(mesh[0], axis=0).tolist()), pose, shape.link, mesh))
+        return solids
 
     def _posture(self, name: str, q: Tensor) -> Tensor:
         q = torch.as_tensor(q)

@@ -18,6 +18,7 @@ from torch import Tensor
 
 from torchcloth.errors import InvalidInput
 
+from .link_meshes import MeshShape
 from .rigid import origin_matrix
 from .urdf_file import parse_urdf
 
@@ -59,7 +60,8 @@ class Description(NamedTuple):
         tip: [4, 4] m, pose of the end frame in the last body.
         limits: [6, J], lower, upper, soft lower, soft upper, velocity, effort.
         shapes: primitive solids.
-        links_without_primitives: links of the chain whose solids are meshes only.
+        mesh_shapes: solids that are mesh files.
+        folder: of the URDF file, where its meshes are searched for.
     """
 
     name: str
@@ -70,7 +72,8 @@ class Description(NamedTuple):
     tip: Tensor
     limits: Tensor
     shapes: tuple[Shape, ...]
-    links_without_primitives: tuple[str, ...]
+    mesh_shapes: tuple[MeshShape, ...]
+    folder: Path
 
 
 def list_models() -> list[str]:
@@ -108,15 +111,15 @@ def read_description(path: Path, frame: str) -> Description:
     if not moving:
         raise InvalidInput(f"no joint of {path} moves {frame!r}", remedy="choose a frame at the end of the arm")
 
-    origins, shapes = [], []
+    origins, solids = [], []
     pending = torch.eye(4, dtype=torch.float64)  # fixed joints are folded into the next moving one
-    shapes += _shapes(robot.link_map[chain[0].parent], 0, pending)
+    solids += _solids(robot.link_map[chain[0].parent], 0, pending)
     for joint in chain:
         pending = pending @ _matrix(joint.origin)
         if joint.type in MOVING_JOINT_TYPES:
             origins.append(pending)
             pending = torch.eye(4, dtype=torch.float64)
-        shapes += _shapes(robot.link_map[joint.child], len(origins), pending)
+        solids += _solids(robot.link_map[joint.child], len(origins), pending)
     return Description(
         name=robot.name or path.stem,
         joint_names=tuple(joint.name for joint in moving),
@@ -125,10 +128,9 @@ def read_description(path: Path, frame: str) -> Description:
         axis=torch.stack([_axis(joint) for joint in moving]),
         tip=pending,
         limits=torch.tensor([_limits(joint) for joint in moving], dtype=torch.float64).T.contiguous(),
-        shapes=tuple(shapes),
-        links_without_primitives=_links_without_primitives(
-            [robot.link_map[chain[0].parent], *(robot.link_map[joint.child] for joint in chain)]
-        ),
+        shapes=tuple(solid for solid in solids if isinstance(solid, Shape)),
+        mesh_shapes=tuple(solid for solid in solids if isinstance(solid, MeshShape)),
+        folder=path.resolve().parent,
     )
 
 
@@ -206,28 +208,29 @@ def _warn_of_strange_limits(joint: Any, lower: float, upper: float) -> None:
     warnings.warn(f"limits of joint {joint.name!r} are {text}", stacklevel=2)
 
 
-def _shapes(link: Any, body: int, placed: Tensor) -> list[Shape]:
-    """Primitives of a link: its collision shapes, or its visual ones if it has no collision shapes."""
+def _solids(link: Any, body: int, placed: Tensor) -> list[Shape | MeshShape]:
+    """Solids of a link: its collision shapes, or its visual ones if it has no others or only those are primitives."""
+    elements, visuals = link.collisions or link.visuals, link.visuals
+    if not any(_primitive(e.geometry) for e in elements) and any(_primitive(e.geometry) for e in visuals):
+        elements = visuals
+    solids: list[Shape | MeshShape] = []
+    for element in elements:
+        primitive, pose = _primitive(element.geometry), placed @ _matrix(element.origin)
+        if primitive is None:
+            file, scale = getattr(element.geometry, "filename", None), getattr(element.geometry, "scale", None)
+            solids.append(MeshShape(file or "", _scale(scale), link.name, body, pose))
+            continue
+        kind, size = primitive
+        if not all(0 < length < math.inf for length in size):
+            what = f"size of a {kind} of link {link.name!r}"
+            raise InvalidInput(what, got=size, expected="finite lengths > 0")
+        solids.append(Shape(kind, size, link.name, body, pose))
+    return solids
 
-    def read(elements: list) -> list[Shape]:
-        primitives = [(_primitive(element.geometry), element) for element in elements]
-        for primitive, _ in primitives:
-            if primitive is not None and not all(0 < size < math.inf for size in primitive[1]):
-                what = f"size of a {primitive[0]} of link {link.name!r}"
-                raise InvalidInput(what, got=primitive[1], expected="finite lengths > 0")
-        return [
-            Shape(*primitive, link.name, body, placed @ _matrix(element.origin))
-            for primitive, element in primitives
-            if primitive is not None
-        ]
 
-    return read(link.collisions) or read(link.visuals)
-
-
-def _links_without_primitives(links: list) -> tuple[str, ...]:
-    """Links with a solid that is a mesh."""
-    solids = [(link.name, link.collisions or link.visuals) for link in links]
-    return tuple(name for name, elements in solids if any(_primitive(e.geometry) is None for e in elements))
+def _scale(scale: Any) -> tuple[float, float, float]:
+    x, y, z = (1.0, 1.0, 1.0) if scale is None or len(scale) != 3 else map(float, scale)
+    return x, y, z
 
 
 def _primitive(geometry: Any) -> tuple[str, tuple[float, ...]] | None:

@@ -19,6 +19,7 @@ import torchcloth as tc
 from torchcloth import recordings as rec
 from torchcloth.errors import InvalidInput, RecordingError
 from torchcloth.recordings import atomic_write, formats, writing
+from torchcloth.recordings.robot_files import locate_mesh_file
 
 FLOAT32 = 1e-7  # relative precision of float32 times the 1 m size of the scene
 HALF_STEP = 0.5e-4 + 1e-12  # points are stored in tenths of a millimetre
@@ -406,6 +407,21 @@ def test_a_urdf_beside_the_episode_is_copied_with_it(with_urdf, tmp_path):
     assert (again / "robots" / "right" / "arm.urdf").is_file()
     assert rec.write(rec.read(again), again, overwrite=True) == again
     assert (again / "robots" / "right" / "arm.urdf").is_file()
+
+
+def test_meshes_of_packages_are_copied_with_their_urdf(with_urdf, tmp_path):
+    """Each to where its name leads from the copy; files that are no meshes stay where they are."""
+    lab = tmp_path / "lab"
+    (lab / "a.stl").write_bytes(b"above")
+    (lab / "parts").mkdir()
+    (lab / "parts" / "b.STL").write_bytes(b"package")
+    names = ("../a.stl", "package://parts/b.STL", "../secret", "package://lab/secret")
+    (lab / "arms" / "arm.urdf").write_text("".join(map(URDF.format, names)))
+    folder = (rec.write(with_urdf, tmp_path / "ep") / "robots" / "right").resolve()
+    (lab / "a.stl").unlink()
+    (lab / "parts" / "b.STL").unlink()
+    contents = {name: None if (file := locate_mesh_file(name, folder)) is None else file.read_text() for name in names}
+    assert contents == dict(zip(names, ("above", "package", None, None), strict=True))
 
 
 def test_a_model_that_is_no_urdf_is_not_copied(with_urdf, tmp_path):

@@ -190,5 +190,5 @@ def test_a_mask_is_that_of_its_own_image(rich, tmp_path):
 
 
 def test_links_that_cannot_be_drawn_are_named(example, monkeypatch):
-    monkeypatch.setattr(robots.Arm, "links_without_primitives", ("link3",))
-    assert "arm 'left': links that are given as meshes alone are not drawn: link3" in film_from_recording(example).notes
+    monkeypatch.setattr(robots.Arm, "unread_meshes", {"link3": "mesh 'a.stl' is not there"})
+    assert "arm 'left': link3 is not drawn: mesh 'a.stl' is not there" in film_from_recording(example).notes

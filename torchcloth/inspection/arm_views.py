@@ -13,7 +13,7 @@ CHECKED_POSTURES = 20
 
 
 def describe_unmodelled_arms(recording: Recording) -> list[str]:
-    """Return a note for each arm without solids, or with links without solids, in view of a depth camera."""
+    """Return a note for each arm without solids, or with meshes that cannot be read, in view of a depth camera."""
     cameras = {name: camera for name, camera in recording.cameras.items() if camera.depth is not None}
     notes = []
     for name, joints in recording.joints.items() if cameras else ():
@@ -24,15 +24,17 @@ def describe_unmodelled_arms(recording: Recording) -> list[str]:
             places = arm.body_poses(q)[..., :3, 3].reshape(-1, 3).numpy()
         except TorchclothError:  # an unknown arm, of which other notes tell
             continue
-        links = arm.links_without_primitives
-        if not links and arm.geometry(q):
+        unread = arm.unread_meshes
+        if not unread and arm.geometry(q):
             continue
         seeing = [camera for camera, lens in cameras.items() if _is_in_view(places, lens)]
         if seeing:
-            what = f"solids of {', '.join(links[:3])}{' and others' if len(links) > 3 else ''}" if links else "solids"
+            links = f"{', '.join(list(unread)[:3])}{' and others' if len(unread) > 3 else ''}"
+            what = f"solids of {links}" if unread else "solids"
+            reason = f" ({next(iter(unread.values()))})" if unread else ""
             notes.append(
                 f"{', '.join(seeing)} sees the arm {name!r}, whose URDF has no {what}: segmentation takes the arm for "
-                "cloth where they touch; add boxes, cylinders or spheres to its URDF"
+                f"cloth where they touch; add meshes, boxes, cylinders or spheres to its URDF{reason}"
             )
     return notes
 

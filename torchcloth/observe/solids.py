@@ -1,4 +1,4 @@
-"""Triangle meshes of simple solids, so that robots and furniture can occlude cloth from a camera."""
+"""Triangle meshes of solids, so that robots and furniture can occlude cloth from a camera."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ _BOX_FACES = np.array(
 
 
 class Solid(Protocol):
-    """A primitive solid at its place, for example one of ``robots.Scene.geometry(q)``."""
+    """A solid at its place, for example one of ``robots.Scene.geometry(q)``."""
 
     @property
     def kind(self) -> str:
-        """Kind of the solid: box, cylinder or sphere."""
+        """Kind of the solid: box, cylinder, sphere or mesh."""
         ...
 
     @property
@@ -33,25 +33,28 @@ class Solid(Protocol):
 
     @property
     def pose(self) -> Any:
-        """Pose [..., 4, 4] m of the centre in the world."""
+        """Pose [..., 4, 4] m of the centre in the world; of a mesh, the origin of its vertices."""
         ...
 
 
 def build_solid_meshes(solids: Iterable[Solid], at: int | None = None) -> list[tuple[Array, Array]]:
-    """Build meshes of a robot's primitives: ``build_solid_meshes(scene.geometry(q), at=k)``.
+    """Build meshes of a robot's solids: ``build_solid_meshes(scene.geometry(q), at=k)``.
 
     Args:
-        solids: with kind, size (see ``build_solid_mesh``) and pose, a tensor or array [4, 4], or [K, 4, 4] at K times.
+        solids: with kind, size (see ``build_solid_mesh``) and pose, a tensor or array [4, 4], or [K, 4, 4] at K times;
+            one of kind "mesh" has ``mesh``, its vertices [V, 3] m and triangles [F, 3].
         at: index of the time; None if there is only one.
     """
     placed = []
     for solid in solids:
         pose = solid.pose.detach().cpu().numpy() if hasattr(solid.pose, "detach") else np.asarray(solid.pose)
-        placed.append(build_solid_mesh(solid.kind, solid.size, pose if at is None else pose[at]))
+        pose = pose if at is None else pose[at]
+        mesh = getattr(solid, "mesh", None)
+        placed.append(build_solid_mesh(solid.kind, solid.size, pose) if mesh is None else _place(*mesh, pose))
     if not placed:
         warnings.warn(
             "no solid: an arm without solids hides nothing, and where a camera sees it, it is taken for cloth; add "
-            "boxes, cylinders or spheres to its URDF",
+            "boxes, cylinders, spheres or meshes to its URDF",
             stacklevel=2,
         )
     return placed
@@ -81,6 +84,10 @@ def build_solid_mesh(kind: str, size: tuple[float, ...], pose: Array, segments: 
         vertices, faces = _BOX_CORNERS * np.asarray(size, float), _BOX_FACES
     else:
         vertices, faces = _revolve(*_outline(kind, size, segments), segments)
+    return _place(vertices, faces, pose)
+
+
+def _place(vertices: Array, faces: Array, pose: Array) -> tuple[Array, Array]:
     pose = np.asarray(pose, dtype=float)
     if pose.shape != (4, 4):
         got = f"shape {pose.shape}"

@@ -12,6 +12,9 @@ from .types import Recording
 
 ROBOTS_FOLDER = "robots"  # of an episode: a folder for each arm
 URDF_SUFFIX = ".urdf"
+MESH_SUFFIXES = (".stl", ".obj", ".ply", ".dae", ".glb", ".gltf")  # only such files are copied from other folders
+MAX_PACKAGE_LEVELS = 4  # folders above a URDF in which its packages may lie
+PACKAGE_PREFIXES = ("package://", "model://")
 _MESH_FILE_PATTERN = re.compile(r"<mesh\b[^>]*?\bfilename\s*=\s*[\"']([^\"']+)[\"']")
 
 
@@ -27,10 +30,33 @@ def locate_urdf_file(model: str, folder: Path | None) -> Path | None:
     return next((path.resolve() for path in paths if is_present(path) and path.is_file()), None)
 
 
-def copy_robot_files(recording: Recording, part: Path) -> Recording:
-    """Copy the URDF of every arm, and the meshes below its folder, into an episode folder that is being written.
+def locate_mesh_file(name: str, folder: Path) -> Path | None:
+    """Return the mesh file that a URDF names; None if there is no such file.
 
-    A URDF that lies nowhere stays named as it is.
+    A name is a path relative to the URDF, an absolute path, ``file://PATH`` or ``package://PACKAGE/PATH``. A package's
+    folder lies beside the URDF or beside one of the four folders above it.
+
+    Args:
+        name: as the URDF says it.
+        folder: of the URDF.
+    """
+    paths = [folder / path for path in (name.removeprefix("file://"), _inner_path(name))]
+    if name.startswith(PACKAGE_PREFIXES):
+        paths = [above / _inner_path(name) for above in (folder, *folder.parents[:MAX_PACKAGE_LEVELS])]
+    return next((path for path in paths if is_present(path) and path.is_file()), None)
+
+
+def _inner_path(name: str) -> PurePosixPath:
+    """Path of a mesh below the folder of its URDF, where a copy of the URDF has it."""
+    path = PurePosixPath(re.sub("^[a-z]+://", "", name))
+    return PurePosixPath(*(part for part in path.parts if part not in ("..", path.anchor)))
+
+
+def copy_robot_files(recording: Recording, part: Path) -> Recording:
+    """Copy the URDF of every arm and its meshes into an episode folder that is being written.
+
+    A URDF that lies nowhere stays named as it is. Meshes outside of the URDF's folder are copied if their names end as
+    those of meshes do.
 
     Args:
         recording: to write.
@@ -55,17 +81,21 @@ def copy_robot_files(recording: Recording, part: Path) -> Recording:
         folder = part / root / name
         folder.mkdir(parents=True, exist_ok=True)
         (folder / file.name).write_bytes(content)
-        for mesh in _meshes_below(file, content):
-            target = folder / mesh
-            target.parent.mkdir(parents=True, exist_ok=True)
-            target.write_bytes((file.parent / mesh).read_bytes())
+        for target, mesh in _locate_meshes(file, content).items():
+            (folder / target).parent.mkdir(parents=True, exist_ok=True)
+            (folder / target).write_bytes(mesh.read_bytes())
         robots[name] = replace(robot, model=f"{root}/{name}/{file.name}")
     return replace(recording, robots=robots)
 
 
-def _meshes_below(file: Path, content: bytes) -> list[PurePosixPath]:
-    """Mesh files that a URDF names by paths within its own folder."""
-    named = {PurePosixPath(path) for path in _MESH_FILE_PATTERN.findall(content.decode(errors="replace"))}
-    inside = [path for path in named if not path.is_absolute() and ".." not in path.parts]
-    paths = {path: (file.parent / path).resolve() for path in inside}
-    return sorted(path for path, real in paths.items() if real.is_relative_to(file.parent) and real.is_file())
+def _locate_meshes(file: Path, content: bytes) -> dict[PurePosixPath, Path]:
+    """Mesh files that a URDF names, by their places in the folder of its copy."""
+    meshes = {}
+    for name in sorted(set(_MESH_FILE_PATTERN.findall(content.decode(errors="replace")))):
+        mesh = locate_mesh_file(name, file.parent)
+        if mesh is None:
+            continue
+        real = mesh.resolve()
+        if real.is_relative_to(file.parent) or real.suffix.lower() in MESH_SUFFIXES:
+            meshes[_inner_path(name)] = real
+    return meshes

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import replace
 
 import numpy as np
@@ -171,17 +172,17 @@ def _arms(recording: Recording, times: Array) -> tuple[dict[str, RigidBody], dic
         try:
             arm = arm_from_recording(recording, name)
             q = np.stack([np.interp(times, motion.t, column) for column in unwrap_joints(arm, motion.q).T], axis=-1)
-            shapes = arm.geometry(torch.as_tensor(q, dtype=arm.base.dtype))
+            with warnings.catch_warnings(action="ignore"):  # of meshes that cannot be read: notes name them
+                shapes = arm.geometry(torch.as_tensor(q, dtype=arm.base.dtype))
             paths |= replay(replace(recording, grippers={}, joints={name: motion}))
-            if links := arm.links_without_primitives:
-                notes.append(f"arm {name!r}: links that are given as meshes alone are not drawn: {', '.join(links)}")
+            notes += [f"arm {name!r}: {link} is not drawn: {why}" for link, why in arm.unread_meshes.items()]
         except ImportError:
             raise
         except TorchclothError as error:
             notes.append(f"arm {name!r} is not drawn: {error}")
             continue
         for number, shape in enumerate(shapes):
-            vertices, faces = build_solid_mesh(shape.kind, shape.size, np.eye(4), segments=16)
+            vertices, faces = shape.mesh or build_solid_mesh(shape.kind, shape.size, np.eye(4), segments=16)
             solids[f"arms/{name}/{number}-{shape.link}"] = RigidBody(vertices, faces, _poses(shape.pose, len(times)))
     return solids, paths, notes
 
