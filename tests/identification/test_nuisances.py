@@ -56,6 +56,22 @@ def test_every_unknown_has_its_slope(objective):
         assert float(error) < 1e-3 * float(size) + 1e-9, k
 
 
+def test_a_turned_grip_turns_what_it_holds_and_leaves_what_is_far(pulled):
+    model = stretched_sheets.build_start_cloth(pulled)
+    episode = build_episode(model, pulled)
+    (turn,) = select_nuisances(["grasp_turn"])
+    modes = turn.initial_shape_modes(model, episode)
+    assert len(modes) == len(turn.number_names(model, episode)) == 3 * len(model.boundaries)
+    for grasp, fields in zip(model.boundaries.values(), modes.split(3), strict=True):
+        held, x = fields[:, grasp.index], episode.initial[grasp.index]
+        apart, moved = x[:, None] - x, held[:, :, None] - held[:, None]
+        assert float((apart * moved).sum(-1).abs().max()) < 1e-12  # distances stay, to first order
+        lever = (episode.initial - x.mean(0)).norm(dim=-1)
+        assert float(fields[1].norm(dim=-1)[lever.argmax()] / lever.max()) < 0.1
+    with pytest.raises(InvalidInput, match="rad"):
+        select_nuisances({"grasp_turn": -1.0})
+
+
 def test_a_first_shape_that_was_not_measured_does_not_settle(pulled):
     """Slopes along where the grippers hold, of cloth that moves from the first frame on."""
     model = stretched_sheets.build_start_cloth(pulled)

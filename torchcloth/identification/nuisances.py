@@ -22,6 +22,7 @@ from ..episodes.replay import Frames
 from ..errors import InvalidInput
 
 CAMERA_TURN_LEVER_M = 0.1  # distance at which a turned camera is off by as much as a shifted one
+GRASP_TURN_REACH = 0.25  # of the cloth's extent, over which the fabric around a grip turns along
 AXIS_NAMES = "xyz"
 MAX_CLOCK_OFFSET_STDS = 2.0  # for which a simulation goes on after the last frame
 
@@ -166,6 +167,26 @@ class GraspOffset(AbstractNuisance):
         return torch.einsum("gv,ab->gavb", weight, torch.eye(3).to(weight)).flatten(0, 1)
 
 
+class GraspTurn(AbstractNuisance):
+    """Turn of what each gripper holds about its middle, at the first frame; the fabric nearby turns along."""
+
+    name, unit, std = "grasp_turn", "rad", 0.1
+
+    def number_names(self, cloth: Cloth, episode: Episode) -> list[str]:
+        """Return names of three axes for each gripper."""
+        return [f"{name}.{a}" for name in _grasped_vertices(cloth) for a in AXIS_NAMES]
+
+    def initial_shape_modes(self, cloth: Cloth, episode: Episode) -> Tensor:
+        """Return small turns, which fade with the distance at rest within a quarter of the cloth's extent."""
+        rest, x = _pattern(cloth).to(episode.initial), episode.initial
+        reach, eye, turns = GRASP_TURN_REACH * cloth.mesh.extent, torch.eye(3).to(x), [x.new_zeros(0, *x.shape)]
+        for index in _grasped_vertices(cloth).values():
+            fading = 1 / (1 + (torch.cdist(rest, rest[index]).amin(1) / reach) ** 2) ** 2
+            arm = (x - x[index].mean(0)) * fading[:, None]
+            turns.append(torch.linalg.cross(eye[:, None].expand(-1, *x.shape), arm.expand(3, -1, -1)))
+        return torch.cat(turns)
+
+
 class FirstStateOffset(AbstractNuisance):
     """Error of the first state: fields along three axes that vanish where the cloth is held.
 
@@ -236,6 +257,7 @@ NUISANCE_KINDS: dict[str, type[AbstractNuisance]] = {
         ForceTare,
         RimOffset,
         GraspOffset,
+        GraspTurn,
         InitialShapeOffset,
         InitialVelocityOffset,
     )

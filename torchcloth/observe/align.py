@@ -16,6 +16,7 @@ from ..meshes import Mesh
 from .least_squares import Equations, solve_moves
 from .rigid import Pose, register_rigidly
 from .shape_prior import ShapePrior
+from .surface_equations import surface_equations
 
 MATCHING_ITERATIONS = 25
 FULL_CLOUD_ITERATIONS = 4  # the last iterations, which use all points
@@ -28,7 +29,6 @@ MAX_RAY_TRIANGLE_PAIRS = 400_000  # per pass
 MAX_DISTANCES_PER_PASS = 4_000_000
 MAX_CLOUD_EXTENT_RATIO = 1.2  # extent of a cloud over that of the cloth
 MIN_OCCLUDER_GAP_M = 1e-3  # an occluder is nearer to the camera by at least this
-POINT_HUBER_THRESHOLD = 2.5  # standard deviations beyond which a point counts linearly
 GOOD_RMS_RATIO = 1.5  # rms distance over noise, below which no other pose is tried
 MAX_RMS_RATIO = 4.0  # rms distance over noise, above which the alignment is refused
 MAX_EDGE_STRAIN = 0.15
@@ -109,36 +109,11 @@ def _bend(mesh: Mesh, x: Tensor, cloud: Tensor, points: Tensor, eye: Tensor | No
             visible = faces[_visible_triangles(x, faces, eye)]
         matched = points if k >= MATCHING_ITERATIONS - FULL_CLOUD_ITERATIONS else points[:COARSE_ALIGNMENT_POINTS]
         data = [
-            *_surface_equations(x, matched, visible, noise),
+            *surface_equations(x, matched, visible, noise),
             _outline_equations(x, cloud, visible, spacing + noise, outline_radius),
         ]
         x = x + solve_moves([*data, *prior.equations(x)], len(x))
     return x
-
-
-def _surface_equations(x: Tensor, points: Tensor, faces: Tensor, noise: float) -> list[Equations]:
-    """Points lie on the surface along its normal; those beyond its edge lie on it in its plane as well."""
-    hits = find_closest_points(points, x, faces)
-    first, second, third = x[hits.corners].unbind(1)
-    normal = torch.nn.functional.normalize(torch.linalg.cross(second - first, third - first), dim=-1)
-    offset = points - hits.interpolate(x)
-    normal_offset = (offset * normal).sum(-1)
-    edge_offset = (offset - normal_offset.unsqueeze(-1) * normal)[hits.is_beyond_edge]
-    size = edge_offset.norm(dim=-1)
-    equations = []
-    for corners, weights, direction, value in (
-        (hits.corners, hits.weights, normal, normal_offset),
-        (
-            hits.corners[hits.is_beyond_edge],
-            hits.weights[hits.is_beyond_edge],
-            edge_offset / size.clamp_min(1e-12).unsqueeze(-1),
-            size,
-        ),
-    ):
-        z = value / noise
-        linear = Equations(corners, weights.unsqueeze(-1) * direction.unsqueeze(1) / noise, z)
-        equations.append(linear.weighted(POINT_HUBER_THRESHOLD / z.abs().clamp_min(POINT_HUBER_THRESHOLD)))
-    return equations
 
 
 def _outline_equations(x: Tensor, cloud: Tensor, faces: Tensor, scatter: float, near: float) -> Equations:
@@ -203,16 +178,19 @@ def _measure_alignment(
     is_covered = nearest < 3 * (noise + _median_spacing(cloud))
     matrix = torch.eye(4, dtype=x.dtype)
     matrix[:3, :3], matrix[:3, 3] = pose
-    sides = (x[faces] - x[faces].roll(-1, 1)).norm(dim=-1)
-    rest = torch.as_tensor(mesh.rest)
-    edge_strain = sides / (rest - rest.roll(-1, 1)).norm(dim=-1) - 1
     return Alignment(
         x=x,
         pose=matrix,
         rms=float(distance.square().mean().sqrt()),
-        strain=float(edge_strain.abs().max()),
+        strain=float(edge_strain(mesh, x).abs().max()),
         coverage=float((area * is_covered).sum() / area.sum()),
     )
+
+
+def edge_strain(mesh: Mesh, x: Tensor) -> Tensor:
+    """Return the strain [F, 3] of the triangles' edges at positions [V, 3] m."""
+    corners, rest = x[torch.as_tensor(mesh.faces)], torch.as_tensor(mesh.rest)
+    return (corners - corners.roll(-1, 1)).norm(dim=-1) / (rest - rest.roll(-1, 1)).norm(dim=-1) - 1
 
 
 def _refuse_misfit(alignment: Alignment, noise: float) -> None:

@@ -116,7 +116,8 @@ def estimate_pose(
     if start != "recording":
         network = _network_of(start)
         shape = estimate_first_shape(cloth, recording, network)
-        recording, nuisances = shape.apply(recording), {"shape": shape.std_rms, **nuisances}
+        recording = shape.apply(recording)
+        nuisances = {"shape": shape.std_rms, "grasp": None, "grasp_turn": None, **nuisances}
         if recording.markers is None and use is None and cloth.mesh.uv is not None:
             recording, std = add_network_answers(cloth, recording, network)
             noise = {"markers": std, **(noise or {})}

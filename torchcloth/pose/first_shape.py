@@ -22,10 +22,11 @@ from ..episodes.observed import Episode, build_episode
 from ..errors import InvalidInput, RecordingError, SimulationDiverged
 from ..losses import chamfer_to_surface
 from ..meshes import Mesh
+from ..observe.align import MAX_EDGE_STRAIN, edge_strain
 from ..recordings import Recording
 from .consistent_state import make_consistent
 from .network import PoseEstimator, PoseNetworkConfig, PosePrediction
-from .scene_frame import PoseInputs, move_to_grippers, rest_coordinates
+from .scene_frame import PoseInputs, build_scene_frame, move_to_grippers, rest_coordinates
 
 SHIPPED_NETWORK = Path(__file__).with_name("pose_network.safetensors")
 NETWORK_FORMAT = "torchcloth-pose-network-1"
@@ -42,13 +43,16 @@ class FirstShape(NamedTuple):
     """The shape of a cloth at the first frame.
 
     Attributes:
+        mesh: of the cloth, whose vertices these are.
         x: [V, 3] m, of the hypothesis that predicts the next clouds best.
         std: [V] m, standard deviation of a coordinate.
         v: [V, 3] m/s; None: from a single cloud, of which the cloth is taken to be at rest.
-        distances: [S] m, mean distance of the next clouds from the simulation of each hypothesis; NaN: it diverged.
+        distances: [S] m, distance of the first cloud from each hypothesis, before it was moved to the cloud, and the
+            mean distance of the next clouds from its simulation, averaged; NaN: the simulation diverged.
         weights: [S], what the network gave each hypothesis.
     """
 
+    mesh: Mesh
     x: Tensor
     std: Tensor
     v: Tensor | None
@@ -61,9 +65,16 @@ class FirstShape(NamedTuple):
         return float(self.std.square().mean().sqrt())
 
     def apply(self, recording: Recording) -> Recording:
-        """Return the recording with this first shape and its velocities, for any estimate, fit or plan."""
-        v = None if self.v is None else self.v.double().numpy()
-        info = replace(recording.cloth, initial_vertices=self.x.double().numpy(), initial_velocities=v)
+        """Return the recording on the cloth's mesh, with this first shape and its velocities, for any further use."""
+        mesh, v = self.mesh, None if self.v is None else self.v.double().numpy()
+        info = replace(
+            recording.cloth,
+            vertices=mesh.vertices,
+            faces=mesh.faces,
+            uv=mesh.uv,
+            initial_vertices=self.x.double().numpy(),
+            initial_velocities=v,
+        )
         return replace(recording, cloth=info)
 
 
@@ -122,6 +133,9 @@ def pose_inputs(
 ) -> PoseInputs:
     """Return what the network sees of one frame, as a batch of one.
 
+    A gripper's frame lies at the middle of the places that its grasp names, and the network is told the centre of all
+    that it holds. How far that is, is known, and its direction is taken to be that of cloth that hangs.
+
     Args:
         cloth: of the episode.
         episode: clouds and grippers' motion.
@@ -139,7 +153,7 @@ def pose_inputs(
     generator = torch.Generator().manual_seed(seed)
     drawn = torch.cat([torch.randperm(len(cloud), generator=generator) for _ in range(-(-POINTS_SEEN // len(cloud)))])
     grip = torch.zeros(len(rest), dtype=torch.int64)
-    position, velocity = rest.new_full((2, 3), torch.nan).float(), rest.new_zeros(2, 3).float()
+    position, velocity, offset = rest.new_full((2, 3), torch.nan).float(), *rest.new_zeros(2, 2, 3).float()
     for k, name in enumerate(find_grippers(cloth, rest)):
         boundary, trajectory = cloth.boundaries[name], episode.motion[name]
         assert isinstance(boundary, Grasp)
@@ -149,9 +163,14 @@ def pose_inputs(
         places = interpolate_poses(trajectory, times.to(trajectory.t))[:, :3, 3].float()
         grip[boundary.index] = k + 1
         position[k], velocity[k] = places[1], (places[2] - places[0]) / float(times[2] - times[0])
+        if boundary.uv is not None:
+            offset[k, :2] = rest[boundary.index, :2].mean(0) - torch.as_tensor(boundary.uv).mean(0)
     before = rest.new_full((len(rest), 3), torch.nan).float() if previous is None else previous.float()
     parts = (cloud[drawn[:POINTS_SEEN]].float(), rest.float(), torch.ones(len(rest), dtype=torch.bool), grip)
-    return PoseInputs(*(part.unsqueeze(0) for part in (*parts, position, velocity, before)))
+    inputs = PoseInputs(*(part.unsqueeze(0) for part in (*parts, position, velocity, before)))
+    frame = build_scene_frame(inputs)
+    hanging = frame.hang(torch.einsum("bij,bkj->bki", frame.rest_axes, offset[None]))
+    return inputs._replace(grip_position=inputs.grip_position + frame.turn_to_world(hanging))
 
 
 def find_grippers(cloth: Cloth, rest: Tensor) -> list[str]:
@@ -162,19 +181,6 @@ def find_grippers(cloth: Cloth, rest: Tensor) -> list[str]:
     centres = torch.stack([rest[cloth.boundaries[name].index].mean(0) for name in names])  # type: ignore[index]
     apart = torch.cdist(centres, centres)
     return [names[k] for k in divmod(int(apart.argmax()), len(names))]
-
-
-def recorded_rest_coordinates(cloth: Cloth, recording: Recording) -> Tensor:
-    """Return rest coordinates [V, 3] m of the recording's own vertices, to which ``initial_vertices`` belong."""
-    return rest_coordinates(recorded_mesh(cloth, recording))
-
-
-def recorded_mesh(cloth: Cloth, recording: Recording) -> Mesh:
-    """Return the recording's own mesh; that of the cloth where the recording has none."""
-    info = recording.cloth
-    if info.vertices is None or info.faces is None:
-        return cloth.mesh
-    return Mesh.build(info.vertices, info.faces, info.uv)
 
 
 # -- the first shape --------------------------------------------------------------------------------------------------
@@ -196,13 +202,13 @@ def estimate_first_shape(
         samples: number of hypotheses.
 
     Raises:
-        RecordingError: no cloud at the first frame.
+        RecordingError: no cloud at the first frame, or a shape that no cloth has.
     """
     network = network or load_network()
     bare = without_first_shape(recording)
     is_single = recording.points is not None and len(recording.points) == 1
     episode = build_episode(cloth, _with_second_cloud(bare) if is_single else bare, has_first_shape=False)
-    rest = recorded_rest_coordinates(cloth, recording)
+    rest = rest_coordinates(cloth.mesh)
     with torch.no_grad():
         inputs = pose_inputs(cloth, episode, 0, rest)
         first = network(inputs, samples)
@@ -210,17 +216,30 @@ def estimate_first_shape(
         hypotheses = torch.cat(
             [move_to_grippers(x[None], s[None], inputs) for x, s in zip(first.hypotheses[0], std, strict=True)]
         )
+        now = _distances_now(cloth, episode, hypotheses)
         if is_single:
-            return FirstShape(hypotheses[0], std[0], None, _distances_now(cloth, episode, hypotheses), weights)
+            return FirstShape(cloth.mesh, hypotheses[0], std[0], None, now, weights)
         velocities = _velocities(network, cloth, episode, rest, first, hypotheses)
-        mesh, gripped = recorded_mesh(cloth, recording), inputs.grip[0].nonzero()[:, 0]
-        states = [make_consistent(mesh, x, v, s, gripped) for x, v, s in zip(hypotheses, velocities, std, strict=True)]
+        gripped = inputs.grip[0].nonzero()[:, 0]
+        states = [
+            make_consistent(cloth.mesh, x, v, s, gripped, inputs.points[0])
+            for x, v, s in zip(hypotheses, velocities, std, strict=True)
+        ]
         hypotheses, velocities = (torch.stack(parts) for parts in zip(*states, strict=True))
-        distances = torch.stack(
+        ahead = torch.stack(
             [_distance_ahead(cloth, episode, x, v) for x, v in zip(hypotheses, velocities, strict=True)]
         )
+    distances = (now + ahead) / 2
     best = int(distances.nan_to_num(torch.inf).argmin())
-    return FirstShape(hypotheses[best], std[best], velocities[best], distances, weights)
+    strain = float(edge_strain(cloth.mesh, hypotheses[best]).abs().max())
+    if not strain <= MAX_EDGE_STRAIN:
+        raise RecordingError(
+            f"{episode.name}: first shape by the network",
+            got=f"an edge strained by {strain:.2g} between what the cloud shows and what the grippers hold",
+            expected=f"at most {MAX_EDGE_STRAIN:g}",
+            remedy="check that the gripper's frame lies where it holds the cloth; else give cloth.initial_vertices",
+        )
+    return FirstShape(cloth.mesh, hypotheses[best], std[best], velocities[best], distances, weights)
 
 
 def without_first_shape(recording: Recording) -> Recording:

@@ -10,8 +10,9 @@ import torch
 from ..cloth import Cloth
 from ..episodes.observed import build_episode
 from ..recordings import Markers, Recording
-from .first_shape import pose_inputs, recorded_mesh, recorded_rest_coordinates, without_first_shape
+from .first_shape import pose_inputs, without_first_shape
 from .network import PoseEstimator
+from .scene_frame import rest_coordinates
 
 MIN_POINTS_FOR_NETWORK = 20  # of a frame that the network looks at
 VERTICES_PER_MARKER = 6  # errors of neighbours are alike
@@ -33,7 +34,7 @@ def add_network_answers(cloth: Cloth, recording: Recording, network: PoseEstimat
         InvalidInput: a cloth whose vertices have no single pattern coordinates.
     """
     episode = build_episode(cloth, without_first_shape(recording), has_first_shape=False)
-    rest, uv = recorded_rest_coordinates(cloth, recording), recorded_mesh(cloth, recording).uv
+    rest, uv = rest_coordinates(cloth.mesh), cloth.mesh.uv
     assert uv is not None
     chosen = np.arange(0, len(rest), VERTICES_PER_MARKER)
     places, variances = np.full((len(episode.times), len(chosen), 3), np.nan), []

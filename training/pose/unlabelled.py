@@ -12,8 +12,9 @@ from torchcloth import identification
 from torchcloth._utils.files import write_atomically
 from torchcloth.boundaries.motion import interpolate_poses
 from torchcloth.errors import InvalidInput
-from torchcloth.pose.first_shape import find_grippers, pose_inputs, recorded_rest_coordinates
+from torchcloth.pose.first_shape import find_grippers, pose_inputs
 from torchcloth.pose.network_answers import MIN_POINTS_FOR_NETWORK
+from torchcloth.pose.scene_frame import rest_coordinates
 from torchcloth.recordings import Recording
 
 from .data import DATA_SCHEMA, MOTION_KNOT_PERIOD_S, motion_path
@@ -48,7 +49,7 @@ def make_unlabelled_motion(recording: Recording, number: int) -> dict[str, Array
     """
     cloth = identification.build_cloth(recording)
     episode = identification.build_episode(cloth, recording, has_first_shape=False)
-    rest = recorded_rest_coordinates(cloth, recording)
+    rest = rest_coordinates(cloth.mesh)
     frames = [k for k, cloud in enumerate(episode.clouds) if len(cloud) >= MIN_POINTS_FOR_NETWORK]
     seen = [pose_inputs(cloth, episode, frame, rest, seed=frame) for frame in frames]
     names = find_grippers(cloth, rest)

@@ -6,10 +6,10 @@ import torch
 from torch import Tensor
 
 from torchcloth.identification import Episode
-from torchcloth.losses import find_closest_points
 from torchcloth.meshes import Mesh
-from torchcloth.observe.least_squares import Equations, expand_to_axes, solve_moves
+from torchcloth.observe.least_squares import expand_to_axes, solve_moves
 from torchcloth.observe.shape_prior import ShapePrior
+from torchcloth.observe.surface_equations import surface_equations
 
 MATCHING_ROUNDS = 8  # of closest points
 EDGE_STRAIN_STD = 0.01  # of the length prior
@@ -53,28 +53,6 @@ def register_frames(episode: Episode, mesh: Mesh, gripped: Tensor, gripped_posit
                 x.new_ones(len(gripped), 1) / GRIP_STD_M,
                 (gripped_positions[t] - x[gripped]) / GRIP_STD_M,
             )
-            x = x + solve_moves([*_pulls(x, cloud, faces, noise), *grip, *prior.equations(x)], len(x))
+            x = x + solve_moves([*surface_equations(x, cloud, faces, noise), *grip, *prior.equations(x)], len(x))
         frames_so_far.append(x)
     return torch.stack(frames_so_far)
-
-
-def _pulls(x: Tensor, cloud: Tensor, faces: Tensor, noise: float) -> list[Equations]:
-    hits = find_closest_points(cloud, x, faces)
-    a, b, c = x[hits.corners].unbind(1)
-    normal = torch.nn.functional.normalize(torch.linalg.cross(b - a, c - a), dim=-1)
-    offset = cloud - hits.interpolate(x)
-    along = (offset * normal).sum(-1)
-    tangential = (offset - along[:, None] * normal)[hits.is_beyond_edge]
-    size = tangential.norm(dim=-1).clamp(min=1e-12)
-    boundary_rows = (
-        hits.corners[hits.is_beyond_edge],
-        hits.weights[hits.is_beyond_edge],
-        tangential / size[:, None],
-        size,
-    )
-    out = []
-    for corners, weights, direction, value in ((hits.corners, hits.weights, normal, along), boundary_rows):
-        coefficients = weights[:, :, None] * direction[:, None] / noise
-        z = value / noise
-        out.append(Equations(corners, coefficients, z).weighted(2.5 / z.abs().clamp(min=2.5)))
-    return out

@@ -53,7 +53,6 @@ SIDE_RANGE_M, ASPECT_RANGE = (0.30, 0.50), (0.75, 1.0)
 CORNER_SIDE_RANGE_M, CORNER_ASPECT_RANGE = (0.36, 0.46), (0.65, 0.78)
 GRIP_RADIUS_M = 0.026
 EDGE_CLAMP_FRACTION, EDGE_CLAMP_DEPTH_M, EDGE_CLAMP_POINT_SPACING_M = 0.4, 0.015, 0.01  # of the width, for each arm
-PATCH_SAMPLE_SPACING_M = 2e-3
 CLAMP_BAR_SIZE_M, CLAMP_BAR_HEIGHT_M = (0.02, 0.03), 0.01  # thickness and height; its middle above the edge
 DISTANCE_RATIO_RANGE = (0.97, 1.006)  # of the grippers, over the distance of what they hold
 TOP_EDGE_M = (0.50, 0.0)  # x and y of the middle of the grippers at rest
@@ -187,10 +186,9 @@ def make_moving_recording(seed: int, size: MovingSize | None = None) -> MovingRe
     times = start + np.arange(int(duration * size.rate) + 1) / size.rate
     rig = bimanual_rig(model="rizon4", frame="tcp_closed")
     motion, path, joints = _draw_reachable_path(motion_rng, rig, hold, times)
-    result, centroids = _simulate(scene, hold, path)
-    seen_poses = {
-        name: _sample_poses(path.t, _at_centroid(pose, centroids[name]), times) for name, pose in path.pose.items()
-    }
+    result, middles = _simulate(scene, hold, path)
+    at_grips = {name: _move_origin(pose, middles[name]) for name, pose in path.pose.items()}
+    seen_poses = {name: _sample_poses(path.t, pose, times) for name, pose in at_grips.items()}
     x, v = (CubicSpline(result.t, frames)(times) for frames in (result.x, result.v))
     arms = _arm_meshes(rig, joints, hold, seen_poses)
     observed = _observe(camera_rng, camera_name, scene.sheet, x, arms, seen_poses, rig, size)
@@ -203,8 +201,8 @@ def make_moving_recording(seed: int, size: MovingSize | None = None) -> MovingRe
         licence="CC0-1.0",
         grasps={name: recordings.GraspInfo(points, hold.radius) for name, points in hold.points.items()},
         grippers={
-            name: _report(knots - start, _sample_poses(path.t, _at_centroid(pose, centroids[name]), knots), robot_rng)
-            for name, pose in path.pose.items()
+            name: _report(knots - start, _sample_poses(path.t, pose, knots), robot_rng)
+            for name, pose in at_grips.items()
         },
         cameras={"cam0": recordings.Camera(**observed.camera.to_calibration())},
         points=recordings.PointClouds(times[seen] - start, np.concatenate(observed.clouds), observed.counts[seen]),
@@ -366,38 +364,30 @@ def _sample_poses(t: Array, pose: Array, times: Array) -> Array:
 
 
 def _simulate(scene: Scene, hold: _Hold, path: _Path) -> tuple[Result, dict[str, Array]]:
-    """Let the sheet settle, then move it; return the motion, and where each gripper has its patch's centroid [3] m."""
+    """Let the sheet settle, then move it; return the motion, and the middle [3] m of what is held, in each gripper."""
     uv, _ = sheet_mesh(scene.sheet)
     first = path.pose[next(iter(path.pose))][0, :3, :3]
     middle = np.mean([pose[0, :3, 3] for pose in path.pose.values()], axis=0)
     x0 = middle + hold.place(uv) @ first.T  # type: ignore[operator]
-    grips, centroids = {}, {}
+    grips, middles = {}, {}
     for name, pose in path.pose.items():
         apart = np.linalg.norm(uv[:, None] - hold.points[name], axis=-1).min(1)
         vertices = np.flatnonzero(apart <= hold.radius + 1e-9)
         grips[name] = Grip(vertices, path.t, pose)
-        centroid = middle + hold.place(_patch_centroid(scene.sheet, hold, name)) @ first.T  # type: ignore[operator]
-        centroids[name] = (centroid[0] - pose[0, :3, 3]) @ pose[0, :3, :3]
+        at = middle + hold.place(hold.points[name].mean(0, keepdims=True)) @ first.T  # type: ignore[operator]
+        middles[name] = (at[0] - pose[0, :3, 3]) @ pose[0, :3, :3]
     step, terms = stable_step(scene), make_force_terms(scene, on_table=False)
     settling_terms = [term for term in terms if term.acts_while_settling]
     settled = MujocoCloth(scene.sheet, step, settling_terms).run(
         x0, np.array([0.0, HANGING_SETTLING_S]), hold_grips(grips), damping_rate=SETTLING_DAMPING_PER_S
     )
-    return MujocoCloth(scene.sheet, step, terms).run(settled.x[-1], path.t, grips), centroids
+    return MujocoCloth(scene.sheet, step, terms).run(settled.x[-1], path.t, grips), middles
 
 
-def _patch_centroid(sheet: SheetSpec, hold: _Hold, name: str) -> Array:
-    """Return the centroid [1, 2] m of the fabric that a gripper holds."""
-    u, v = (np.linspace(0, side, round(side / PATCH_SAMPLE_SPACING_M) + 1) for side in (sheet.width, sheet.height))
-    uv = np.stack(np.meshgrid(u, v), -1).reshape(-1, 2)
-    apart = np.linalg.norm(uv[:, None] - hold.points[name], axis=-1).min(1)
-    return uv[apart <= hold.radius].mean(0, keepdims=True)
-
-
-def _at_centroid(pose: Array, centroid: Array) -> Array:
+def _move_origin(pose: Array, place: Array) -> Array:
     """Return poses [K, 4, 4] m with their origin at a place [3] m in the gripper."""
     out = pose.copy()
-    out[:, :3, 3] += pose[:, :3, :3] @ centroid
+    out[:, :3, 3] += pose[:, :3, :3] @ place
     return out
 
 
