@@ -380,10 +380,82 @@ def write_kinect(folder: Path, *, size: tuple[int, int] = (320, 288), frames: in
     return ForeignRecording(path, scene, images, dict.fromkeys(images, times))
 
 
+CLOUD_STAMPS_S = ("1753623328.250000", "1753623328.310000", "1753623328.372500")
+
+
+def draw_clouds(seed: int) -> list[np.ndarray]:
+    rng = np.random.default_rng(seed)
+    return [rng.uniform(-0.2, 0.2, (k, 3)).astype(np.float32) for k in (6, 4, 5)]
+
+
+def write_cloud(path: Path, cloud: np.ndarray, *, ascii_text: bool = False, compressed: bool = False) -> None:
+    """Write a cloud by open3d.io, which adds a colour."""
+    import open3d as o3d
+
+    points = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(cloud.astype(float)))
+    points.paint_uniform_color([0.2, 0.4, 0.6])
+    assert o3d.io.write_point_cloud(str(path), points, write_ascii=ascii_text, compressed=compressed)
+
+
+def write_poses(path: Path, stamps: list[str], position: np.ndarray, quat: np.ndarray) -> None:
+    """Write poses as RGBench's tools do, with the angles of the joints before them."""
+    heads = ["time", *(f"pos_{k}" for k in range(1, 7)), "pos_gripper", "pos_x", "pos_y", "pos_z"]
+    lines = [",".join([*heads, "orn_w", "orn_x", "orn_y", "orn_z"])]
+    for stamp, x, q in zip(stamps, position.tolist(), quat.tolist(), strict=True):
+        lines.append(",".join([stamp, *["0.1"] * 6, "0.02", *map(repr, [*x, *q])]))
+    path.write_text("\n".join(lines) + "\n")
+
+
+def write_pcd(folder: Path) -> ForeignRecording:
+    """Write a folder of clouds in all three encodings by open3d.io, with tables of stamps and of a gripper's poses."""
+    root, clouds, rng = folder / "pcd", draw_clouds(5), np.random.default_rng(6)
+    root.mkdir(parents=True)
+    names = [f"cloud_{i}.pcd" for i in (2, 0, 1)]  # the table gives the order
+    for i, (name, cloud) in enumerate(zip(names, clouds, strict=True)):
+        write_cloud(root / name, cloud, ascii_text=i == 0, compressed=i == 2)
+    clouds[0] = np.loadtxt((root / names[0]).read_text().split("DATA ascii\n")[1].splitlines(), usecols=(0, 1, 2))
+    rows = [f"{stamp},{name}" for stamp, name in zip(CLOUD_STAMPS_S, names, strict=True)]
+    (root / "stamps.csv").write_text("\n".join(["timestamp_sec,filename", *rows]) + "\n")
+    position, quat = rng.uniform(-0.2, 0.2, (5, 3)), rng.normal(size=(5, 4))
+    quat /= np.linalg.norm(quat, axis=1, keepdims=True)
+    write_poses(root / "hand.csv", [f"1753623328.{24 + 4 * k}" for k in range(5)], position, quat)
+    arrays = {"left/t": np.arange(5) / 25, "left/position": position, "left/quat_wxyz": quat}
+    arrays |= {"left/closed": np.ones(5, bool), "points/t": np.array([0.01, 0.07, 0.1325])}
+    arrays["points/xyz"] = np.concatenate(clouds).astype(float)
+    scene = {**SCENE_DESCRIPTION, "source": {"motion": {"left": {"file": "hand.csv", "closed": True}}}}
+    return ForeignRecording(root, scene, arrays=arrays)
+
+
+def write_rgbench(folder: Path) -> ForeignRecording:
+    """Write a capture in the layout of RGBench, whose grippers hold points of the clouds."""
+    root, clouds, rng = folder / "fling", draw_clouds(7), np.random.default_rng(8)
+    for name in ("calibration", "joints", "segment_pcds"):
+        (root / name).mkdir(parents=True)
+    (root / "calibration" / "world_to_camera_transform.json").write_text(
+        json.dumps(np.linalg.inv(CAMERA_POSE).tolist())
+    )
+    for stamp, cloud in zip(CLOUD_STAMPS_S, clouds, strict=True):
+        write_cloud(root / "segment_pcds" / f"pointcloud_{stamp}_segmented.pcd", cloud)
+    pose = np.linalg.inv(np.linalg.inv(CAMERA_POSE))
+    points = np.concatenate(clouds) @ pose[:3, :3].T + pose[:3, 3]
+    arrays = {"points/t": np.array([0.0, 0.06, 0.1225]) + 0.06125, "points/xyz": points}
+    for arm, y, k in (("left", 0.25, 0), ("right", -0.25, 1)):
+        position, quat = points[k] + rng.uniform(-0.01, 0.01, (8, 3)), rng.normal(size=(8, 4))
+        quat /= np.linalg.norm(quat, axis=1, keepdims=True)
+        local = position - [0.0, y, 0.0]
+        stamps = [f"1753623328.{250 + 30 * i}" for i in range(8)]
+        write_poses(root / "joints" / f"{arm}_arm_joint_states_and_end_pose.csv", stamps, local, quat)
+        arrays |= {f"{arm}/t": np.arange(8) * 0.03, f"{arm}/position": np.add(local, [0.0, y, 0.0])}
+        arrays |= {f"{arm}/quat_wxyz": quat, f"{arm}/closed": np.ones(8, bool)}
+    return ForeignRecording(root, dict(SCENE_DESCRIPTION), arrays=arrays)
+
+
 WRITERS = {
     "redwood": write_redwood,
     "tum": write_tum,
     "ros2": write_ros2,
     "lerobot": copy_lerobot,
     "kinect": write_kinect,
+    "pcd": write_pcd,
+    "rgbench": write_rgbench,
 }

@@ -111,6 +111,28 @@ TUM_LISTS = """# colour
 1305031102.17 0.5 0.1 1.5 0.6 0.8 0.0 0.0
 1305031102.27 0.5 0.1 1.5 0.6 0.8 0.0 0.0
 """
+PCD_HEADER = """# .PCD v0.7 - Point Cloud Data file format
+VERSION 0.7
+FIELDS x y z rgb
+SIZE 4 4 4 4
+TYPE F F F U
+COUNT 1 1 1 1
+WIDTH 2
+HEIGHT 1
+VIEWPOINT 0 0 0 1 0 0 0
+POINTS 2
+DATA """
+PCD_POINTS = np.array([(0.1, 0.0, 0.5, 7), (0.1, 0.2, 0.5, 7)], "<f4,<f4,<f4,<u4")
+CLOUD_TABLES = """
+====
+header.stamp.secs,header.stamp.nsecs,filename
+1305031102,170000000,1.pcd
+====
+time,pos_1,pos_x,pos_y,pos_z,orn_w,orn_x,orn_y,orn_z
+1305031102.17,0.1,0.5,0.1,0.4,0.6,0.8,0.0,0.0
+1305031102.18,0.1,0.5,0.1,0.41,0.6,0.8,0.0,0.0
+1305031102.19,0.1,0.5,0.1,0.42,0.6,0.8,0.0,0.0
+"""
 TENSION_TABLE = """{"format": "torchcloth-tension", "version": 1, "length": 0.097, "width": 0.027, "angle": 0.785,
  "preload": 0.15, "provenance": "measured", "licence": "CC0", "clamp": "rubber"}
 ====
@@ -133,6 +155,7 @@ def write_seeds(folder: Path) -> None:
         "ply/binary": make_binary_ply(),
         "urdf/arm": ARM.encode(),
         "tum/lists": TUM_LISTS.encode(),
+        **{f"pcd/{name}": cloud + CLOUD_TABLES.encode() for name, cloud in make_clouds().items()},
         "tension/table": TENSION_TABLE.encode(),
         "episode/all_keys": make_episode_json(),
         "tcm/model": make_model(),
@@ -263,6 +286,18 @@ def make_bag(storage: str, *, checksums: bool = False) -> bytes:
         if checksums:
             mcap_checksums.write_checksums(file)
         return file.read_bytes()
+
+
+def make_clouds() -> dict[str, bytes]:
+    """Make a cloud in each encoding; LZF has the first point as literals, and the second one refers to it."""
+    first, second = (PCD_POINTS[k : k + 1].tobytes() for k in (0, 1))
+    fields = b"".join(PCD_POINTS[name].tobytes() for name in PCD_POINTS.dtype.names)
+    x, rest = fields[:4], fields[8:]
+    packed = bytes([3]) + x + bytes([2 << 5, 3]) + bytes([len(rest) - 1]) + rest
+    sizes = np.array([len(packed), len(fields)], "<u4").tobytes()
+    text = "0.1 0 0.5 7\n0.1 0.2 0.5 7"
+    bodies = {"ascii": text.encode(), "binary": first + second, "binary_compressed": sizes + packed}
+    return {name: f"{PCD_HEADER}{name}\n".encode() + body for name, body in bodies.items()}
 
 
 def make_own_mcap() -> bytes:

@@ -14,7 +14,7 @@ from .output_paths import check_output_folder, output_path
 if TYPE_CHECKING:
     from ..recordings import Recording
 
-FORMATS = ("episode", "ros2", "lerobot", "redwood", "tum", "kinect")
+FORMATS = ("episode", "ros2", "lerobot", "redwood", "tum", "kinect", "rgbench", "pcd")
 MCAP_SUFFIX = ".mcap"
 # Suffixes that a folder would hardly have.
 FILE_SUFFIXES = ".mcap .bag .db3 .mkv .mp4 .json .npz .npy .h5 .hdf5 .parquet .csv .txt .zip .tar .gz .tgz .zst"

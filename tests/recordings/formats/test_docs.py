@@ -33,9 +33,14 @@ def test_the_episode_can_be_read(tmp_path):
 
 
 def test_the_scene_files_can_be_read(tmp_path):
-    tum, ros2 = json_blocks("how-to/import-recordings.md")
+    tum, ros2, pcd = json_blocks("how-to/import-recordings.md")
     scene_file_keys.check_keys(json.loads(ros2), "docs/how-to/import-recordings.md")
     truth = foreign_formats.write_tum(tmp_path)
     (truth.path / "groundtruth.txt").unlink()
     truth.scene = json.loads(tum)
     assert formats.read(truth.path, scene=truth.write_scene()).cameras["cam0"].K[0, 0] == 517.3
+    truth = foreign_formats.write_pcd(tmp_path)
+    truth.scene = json.loads(pcd)
+    np.testing.assert_allclose(
+        formats.read(truth.path, scene=truth.write_scene()).points.xyz[:, 0], truth.arrays["points/xyz"][:, 1] + 0.5
+    )

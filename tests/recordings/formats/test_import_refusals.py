@@ -579,7 +579,7 @@ def test_a_folder_without_colour_is_read(copy, name, parts):
 
 
 def test_a_folder_of_point_clouds_says_what_to_do(tmp_path):
-    (tmp_path / "0000.pcd").write_text("# .PCD v0.7 - Point Cloud Data file format")
-    for path, what in ((tmp_path, "a folder with 0000.pcd"), (tmp_path / "0000.pcd", r"a point cloud \(PCD\)")):
+    (tmp_path / "0000.ply").write_text("ply\nformat ascii 1.0")
+    for path, what in ((tmp_path, "a folder with 0000.ply"), (tmp_path / "0000.ply", r"a point cloud or mesh \(PLY\)")):
         with pytest.raises(RecordingError, match=f"got {what}; .*build PointClouds in Python"):
             formats.read(path)

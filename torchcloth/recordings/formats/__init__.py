@@ -9,6 +9,8 @@ LeRobot v3                    ``lerobot``
 Azure Kinect .mkv             ``kinect``
 Open3D/Redwood RGB-D folders  ``redwood``
 TUM RGB-D folders             ``tum``
+Folders of .pcd clouds        ``pcd``
+Captures of RGBench           ``rgbench``
 ============================  ==========================================
 
 Each importer is a module that defines an ``Importer``. What only
@@ -27,15 +29,25 @@ from ..types import Recording
 from .kinect import KINECT_IMPORTER
 from .lerobot import LEROBOT_IMPORTER, LEROBOT_NAME
 from .mcap_writer import write as write_mcap
+from .pcd import PCD_IMPORTER
 from .redwood import REDWOOD_IMPORTER
+from .rgbench import RGBENCH_IMPORTER
 from .ros2 import ROS2_IMPORTER
 from .scene_file import SceneFile
 from .tum import TUM_IMPORTER
 
-IMPORTERS = (ROS2_IMPORTER, LEROBOT_IMPORTER, REDWOOD_IMPORTER, TUM_IMPORTER, KINECT_IMPORTER)
+IMPORTERS = (
+    ROS2_IMPORTER,
+    LEROBOT_IMPORTER,
+    REDWOOD_IMPORTER,
+    TUM_IMPORTER,
+    KINECT_IMPORTER,
+    RGBENCH_IMPORTER,
+    PCD_IMPORTER,
+)
 EPISODE_FOLDER_FORMAT = "episode"
 FORMAT_NAMES = (EPISODE_FOLDER_FORMAT, *(importer.name for importer in IMPORTERS))
-CLOUD_SUFFIXES = {".pcd", ".ply", ".xyz", ".las", ".npy"}
+CLOUD_SUFFIXES = {".ply", ".xyz", ".las", ".npy"}
 BUILD_IN_PYTHON_PAGE = "docs/how-to/import-recordings.md, Add the motion in Python"
 FOREIGN_SIGNATURES = {  # of files that are often confused with a recording
     b"PAR1": "a parquet file",

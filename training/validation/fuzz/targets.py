@@ -309,6 +309,17 @@ def read_tum(data: bytes) -> None:
     invariants.check_recording(formats.read(folder, scene=scratch_folder() / "tum.json"))
 
 
+@register_format("pcd", mutations.mutate_text, READING)
+def read_pcd(data: bytes) -> None:
+    """Read a folder of one cloud, its table of times, and the table of a gripper's poses."""
+    folder, scene = scratch_folder() / "pcd", scratch_folder() / "pcd.json"
+    folder.mkdir(exist_ok=True)
+    source = {"times": "stamps.csv", "motion": {"left": {"file": "poses.csv", "closed": True}}}
+    scene.write_text(json.dumps({**{key: BAG_SCENE[key] for key in ("provenance", "cloth")}, "source": source}))
+    write_parts(folder, ("1.pcd", "stamps.csv", "poses.csv"), data)
+    invariants.check_recording(formats.read(folder, scene=scene))
+
+
 @register_format("tension", mutations.mutate_text, READING)
 def read_tension(data: bytes) -> None:
     """Read the two files of a table of a tension machine."""
