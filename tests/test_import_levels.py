@@ -29,7 +29,7 @@ LEVELS = (
     ("pose",),
     ("diagnosis",),
     ("planning",),
-    ("synthesis", "viewing"),
+    ("authoring", "synthesis", "viewing"),
     ("",),  # torchcloth/__init__.py: the names a user sees
     ("training",),
     ("benchmarks",),

@@ -16,7 +16,7 @@ from typing import Any, NoReturn
 
 from .._utils.files import DISK_FULL_ERROR_NUMBERS
 from ..errors import InvalidInput, TorchclothError, to_message_part
-from . import bench, confirm, convert, diagnose, doctor, identify, inspect, plan, pose, predict, simulate, view
+from . import bench, confirm, convert, diagnose, doctor, identify, inspect, new, plan, pose, predict, simulate, view
 
 VERBS = (
     identify,
@@ -27,6 +27,7 @@ VERBS = (
     plan,
     inspect,
     view,
+    new,
     convert,
     simulate,
     doctor,

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import fields
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -31,6 +32,7 @@ def write(
     overwrite: bool = False,
     compact: bool = True,
     on_image: Callable[[], None] = lambda: None,
+    attachments: Mapping[str, bytes] = MappingProxyType({}),
 ) -> Path:
     """Write an episode folder atomically; a recording that cannot be read back is refused.
 
@@ -44,6 +46,7 @@ def write(
         overwrite: replace an existing episode; a folder that is not an episode is never replaced.
         compact: store points in tenths of a millimetre (int16) if they fit, else as float32.
         on_image: called after each image, for a progress bar.
+        attachments: further files by name, such as a picture, which no reader looks at.
 
     Returns:
         The path of the episode.
@@ -54,6 +57,8 @@ def write(
     check_recording(recording)
 
     def fill(part: Path, shown: Path) -> None:
+        for name, content in attachments.items():
+            (part / checks.check_name(name, f"attachments[{name!r}]")).write_bytes(content)
         _fill(part, recording, compact, on_image)
         read_folder(Folder(part, display_path=shown), with_truth=True)
 
