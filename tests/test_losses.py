@@ -270,6 +270,19 @@ def test_chamfer_values():
     assert float(chamfer_to_vertices(flat[3:5] + torch.tensor([0.0, 0.0, 0.005]), flat)) == pytest.approx(0.005)
 
 
+def test_the_norms_of_distances_to_vertices_by_hand():
+    """The second mesh has another nearest vertex in each norm: (3, 3, 3) m away, or (0, 6, 0) m."""
+    corners = torch.tensor([[0.0, 0.0, 0.0], [10.0, 3.4, 0.0]], dtype=torch.float64)
+    points = torch.tensor([[3.0, 4.0, 0.0], [10.0, 3.4, 2.0]], dtype=torch.float64)
+    assert float(chamfer_to_vertices(points, corners)) == pytest.approx((5 + 2) / 2)
+    assert float(chamfer_to_vertices(points, corners, norm=1)) == pytest.approx((7 + 2) / 2)
+    others = torch.tensor([[6.0, 7.0, 3.0], [3.0, 10.0, 0.0]], dtype=torch.float64)
+    assert float(chamfer_to_vertices(points[:1], others)) == pytest.approx(27**0.5)
+    assert float(chamfer_to_vertices(points[:1], others, norm=1)) == pytest.approx(6.0)
+    with pytest.raises(InvalidInput, match="norm; got 3; expected 1 or 2"):
+        chamfer_to_vertices(points, corners, norm=3)
+
+
 def test_float32(vertices, points):
     exact = chamfer_to_surface(points, vertices, FACES)
     got = chamfer_to_surface(points.float(), vertices.float(), FACES)
