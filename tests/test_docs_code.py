@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 import torch
 from helpers import foreign_formats
+from helpers.bench_files import write_bar
 
 import torchcloth as tc
 from torchcloth import recordings
@@ -26,6 +27,7 @@ BLOCK = re.compile(r"^```python\n(.*?)^```", re.DOTALL | re.MULTILINE)
 PREPARE: dict[str, Callable[[Path], dict[str, Any]]] = {}  # page: files and names that its text assumes
 CHECK: dict[str, Callable[[dict[str, Any]], None]] = {}  # page: what must hold after its blocks
 SLOW_PAGES = {  # they take ten seconds and more
+    "docs/how-to/new-episode.md",
     "docs/how-to/simulate-recordings.md",
     "docs/tutorials/from-depth-images-to-a-fabric.md",
     "docs/tutorials/plan-an-arm-motion.md",
@@ -61,9 +63,16 @@ def prepare_depth_images(folder: Path) -> dict[str, Any]:
     return {}
 
 
+def prepare_bench(folder: Path) -> dict[str, Any]:
+    """Write joints in CSV and depth images in PNG, of a sheet on a bar."""
+    write_bar(folder / "bench")
+    return {}
+
+
 PREPARE |= {
     "docs/how-to/own-arm.md": prepare_arm,
     "docs/how-to/import-recordings.md": prepare_depth_images,
+    "docs/how-to/new-episode.md": prepare_bench,
 }
 
 
@@ -101,6 +110,11 @@ def check_imports(namespace: dict[str, Any]) -> None:
     assert json.loads(Path("fit/identification.json").read_text())["parameters"]["air.normal"]
 
 
+def check_new_episode(namespace: dict[str, Any]) -> None:
+    assert len(recordings.read("from_bench").require("points")) > 10
+    assert Path("from_bench/new.png").is_file()
+
+
 def check_tension(namespace: dict[str, Any]) -> None:
     assert namespace["fit"].parameters["shear_modulus"].identifiable
     assert main(["predict", "nylon", "--angle", "30", "--out", "thirty"]) == 0
@@ -120,6 +134,7 @@ CHECK |= {
     "README.md": check_layer,
     "docs/how-to/own-arm.md": check_arm,
     "docs/how-to/import-recordings.md": check_imports,
+    "docs/how-to/new-episode.md": check_new_episode,
     "docs/how-to/tension-machine.md": check_tension,
     "docs/tutorials/from-depth-images-to-a-fabric.md": check_tutorial,
 }

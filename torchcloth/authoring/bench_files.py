@@ -106,15 +106,16 @@ def read_arms(
     if len(set(names)) < len(names):
         raise InvalidInput("names of the grippers", got=", ".join(names), expected="one name for each")
     unplaced = [file for file in files if file.base is None]
-    if unplaced and len({str(file.urdf) for file in files}) < len(files) and len({f.tool for f in files}) < len(files):
-        got = f"{len(unplaced)} arms of {len(files)} without a base"
-        raise InvalidInput("base", got=got, expected="the pose of each arm's base, which differ", remedy="give --base")
+    is_one_robot = len({str(file.urdf) for file in files}) == 1 and len({file.tool for file in files}) == len(files)
+    if unplaced and len(files) > 1 and not is_one_robot:
+        got = f"{len(unplaced)} of {len(files)} arms without it"
+        raise InvalidInput("base", got=got, expected="the pose of each arm in the world", remedy="give --base for each")
     arms: dict[str, BenchArm] = {}
     notes = []
     for name, file in zip(names, files, strict=True):
         base = None if file.base is None else torch.as_tensor(read_pose(Path(file.base)))
         arm = load(file.urdf, frame=file.tool, base=base)
-        log = read_joint_log(Path(file.joints), _joint_names(arm), angle_unit=angle_unit, time_unit=time_unit)
+        log = read_joint_log(Path(file.joints), _joint_names(arm, name), angle_unit=angle_unit, time_unit=time_unit)
         arms[name] = BenchArm(arm, log, file)
         notes += [note for note in log.notes if note not in notes]
         if log.closed is None:
@@ -136,13 +137,13 @@ def load_depth(camera: Camera, image: int) -> np.ndarray:
     return decode_depth(depth_stream(camera).load(image), camera.depth_scale)
 
 
-def _joint_names(arm: Arm) -> JointNames:
+def _joint_names(arm: Arm, name: str) -> JointNames:
     """The arm's joints with limits that can be believed: equal ones and those in degrees count as none."""
     lower, upper = arm.limits.lower.numpy().copy(), arm.limits.upper.numpy().copy()
     is_prismatic = np.array([kind == "prismatic" for kind in arm.joint_types])
     is_strange = (lower == upper) | (~is_prismatic & (np.maximum(np.abs(lower), np.abs(upper)) > 4 * np.pi))
     lower[is_strange], upper[is_strange] = -np.inf, np.inf
-    return JointNames(tuple(arm.joint_names), is_prismatic, lower, upper)
+    return JointNames(tuple(arm.joint_names), is_prismatic, lower, upper, name)
 
 
 def read_camera(files: CameraFiles, time_unit: TimeUnit | None) -> tuple[BenchCamera, list[str]]:

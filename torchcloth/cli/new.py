@@ -106,7 +106,7 @@ def _new(options: argparse.Namespace) -> int:
     if os.path.lexists(target) and not options.overwrite:
         raise InvalidInput("DIR exists", got=target, expected="a new name", remedy="choose one, or give --overwrite")
     if os.path.lexists(target) and not (target / EPISODE_FILE).is_file():
-        raise InvalidInput("DIR is no episode", got=target, expected="an episode to replace", remedy="choose a new name")
+        raise InvalidInput("DIR is no episode", got=target, expected="an episode", remedy="choose a new name")
     check_output_folder(target.parent, "DIR")
     for option in ("mass", "grip_radius", "depth_scale", "fps"):
         if (value := getattr(options, option)) is not None and not 0 < value < float("inf"):

@@ -67,12 +67,14 @@ class JointNames(NamedTuple):
         names: J names.
         is_prismatic: [J] bool.
         lower, upper: [J] rad or m, limits; infinite where there are none.
+        arm: name of the arm, which tells its columns from those of another arm with joints of the same names.
     """
 
     names: tuple[str, ...]
     is_prismatic: np.ndarray
     lower: np.ndarray
     upper: np.ndarray
+    arm: str = ""
 
 
 class JointLog(NamedTuple):
@@ -108,7 +110,7 @@ def read_joint_log(
     table = read_table(path)
     times = find_time_columns(table)
     stamps = read_stamps(table, times, MAX_JOINT_INTERVAL_S, time_unit)
-    columns, column_notes = _find_columns(table, joints.names, [k for k in times if k is not None])
+    columns, column_notes = _find_columns(table, joints, [k for k in times if k is not None])
     order, order_notes = order_by_stamp(stamps.ns.tolist(), ["\0".join(row).encode() for row in table.rows], path.name)
     q, angle_notes = _to_radians(table, columns, joints, angle_unit)
     closed = _read_closed(table)
@@ -124,8 +126,9 @@ def read_joint_log(
     return JointLog(stamps.ns[order], q[order], None if closed is None else closed[order], tuple(notes))
 
 
-def _find_columns(table: Table, names: tuple[str, ...], times: list[int]) -> tuple[list[int], list[str]]:
+def _find_columns(table: Table, joints: JointNames, times: list[int]) -> tuple[list[int], list[str]]:
     """Return the column of each joint, and notes on how they were recognised."""
+    names, arm = joints.names, set(split_words(joints.arm))
     rest = [k for k in range(len(table.rows[0])) if k not in times]
     if table.heads is None:
         if len(rest) < len(names):
@@ -135,6 +138,8 @@ def _find_columns(table: Table, names: tuple[str, ...], times: list[int]) -> tup
             notes.append(f"{table.path.name}: {len(rest) - len(names)} columns after the joints are not used")
         return rest[: len(names)], notes
     heads, words = table.heads, [split_words(head) for head in table.heads]
+    of_arm = [k for k in rest if arm and arm <= set(words[k])]
+    rest = of_arm if len(of_arm) >= len(names) else rest
     by_name = [_columns_of_joint(name, heads, words, rest) for name in names]
     if all(len(columns) == 1 for columns in by_name):
         return [columns[0] for columns in by_name], []
