@@ -205,11 +205,14 @@ def few(recording, count):
 
 
 def test_few_points_of_unknown_noise_are_not_taken_for_exact(scene):
-    """Too few to tell noise from shape: taken as exact, they made every error three times as large."""
+    """Too few to tell noise from shape: taken as exact, they made every error three times as large.
+
+    Depth of a camera that nobody knows may be off by twice its scatter.
+    """
     sparse, cloth = few(scene.recording, 60), build_cloth(scene, twins.TRUE_FABRIC)
     stated = estimate_pose(cloth, sparse, modes=4, window=0.18)
     unknown = estimate_pose(cloth, replace(sparse, observation_noise_std=None), modes=4, window=0.18)
-    assert unknown.fit["std_rms"] == pytest.approx(stated.fit["std_rms"], rel=0.2)
+    assert stated.fit["std_rms"] < unknown.fit["std_rms"] < 2 * stated.fit["std_rms"]
     assert coverage(unknown, scene)[0] > 0.88
 
 

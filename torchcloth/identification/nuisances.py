@@ -170,7 +170,7 @@ class GraspOffset(AbstractNuisance):
 class GraspTurn(AbstractNuisance):
     """Turn of what each gripper holds about its middle, at the first frame; the fabric nearby turns along."""
 
-    name, unit, std = "grasp_turn", "rad", 0.1
+    name, unit, std = "grasp_turn", "rad", 0.05
 
     def number_names(self, cloth: Cloth, episode: Episode) -> list[str]:
         """Return names of three axes for each gripper."""

@@ -25,7 +25,7 @@ from ..identification.nuisances import FirstStateOffset, add_lookahead, as_stds,
 from ..identification.residuals.blocks import select_blocks
 from ..identification.residuals.metrics import MIN_NOISE_SCALE, distance_metrics
 from ..identification.residuals.rigid_carry import carry_rigidly
-from ..identification.uncertainty.consider_covariance import with_grasp_offsets
+from ..identification.uncertainty.consider_covariance import CONSIDERED_GRIP_STD_M, with_grasp_offsets
 from ..identification.uncertainty.estimates import make_estimates, make_nuisance_estimates
 from ..inspection.corrections import check_all
 from ..meshes.mesh import vertex_normals
@@ -43,8 +43,9 @@ from .smoothing import SmoothedPose, smooth
 from .visibility import find_seen_vertices
 from .warnings import pose_warnings
 
-# A depth camera is off by patches, slowly, and the estimate follows it: by a millimetre at a metre (Kinect, stereo).
-SLOW_DEPTH_ERROR_STD_M = 1e-3
+# A depth camera is off by patches, slowly, and the estimate follows it: by a millimetre at a metre at least, and by
+# more than its points scatter: Kinect and calibrated stereo scatter by 2 mm, and are off by some 5 mm.
+SLOW_DEPTH_ERROR_STD_M, SLOW_DEPTH_ERROR_RATIO = 1e-3, 2.0
 INITIAL_FORCE_STD_M_PER_S2 = 0.5  # of the corrective force; its size is then learnt from the recording
 
 Progress = Callable[[str, float], None]
@@ -83,8 +84,8 @@ def estimate_pose(
             errors are part of the result's.
         window: duration in which the force is constant [s].
         modes: number of smooth fields over the fabric for each axis of the force.
-        nuisances: as in ``identify``: "clock", "camera", "grasp", "shape", "velocity". Where the cloth moves at the
-            first frame, the last two join, in as many fields as the force has.
+        nuisances: as in ``identify``: "clock", "camera", "grasp", "grasp_turn", "shape", "velocity". Where the cloth
+            moves at the first frame, the last two join, in as many fields as the force has.
         use: kinds of data, some of "points", "markers" and "force"; None: all that the recording has.
         noise: least standard deviation by kind of data, as in ``identify``.
         dt: largest substep [s]; None: the stable one.
@@ -92,8 +93,9 @@ def estimate_pose(
         checks: look for frozen clouds and for a clock that is off, as ``identify`` does (``inspection.corrections``).
             The result has no frames where clouds were frozen. A clock that is off is corrected, and becomes a nuisance.
         start: where the first shape comes from: the recording; the shipped network (`estimate_first_shape`), which also
-            tells how fast the cloth moves; or a network of one's own. A network's shape is a start: the nuisance
-            "shape" is added with its error. Its answers to all clouds count as data, unless ``use`` says what counts.
+            tells how fast the cloth moves; or a network of one's own. A network's shape is a start: the nuisances
+            "shape", with its error, "grasp" and "grasp_turn" are added. Its answers to all clouds count as data, unless
+            ``use`` says what counts.
 
     Returns:
         Frames with standard errors, visibility, forces, warnings.
@@ -117,7 +119,7 @@ def estimate_pose(
         network = _network_of(start)
         shape = estimate_first_shape(cloth, recording, network)
         recording = shape.apply(recording)
-        nuisances = {"shape": shape.std_rms, "grasp": None, "grasp_turn": None, **nuisances}
+        nuisances = {"shape": shape.std_rms, "grasp": CONSIDERED_GRIP_STD_M, "grasp_turn": None, **nuisances}
         if recording.markers is None and use is None and cloth.mesh.uv is not None:
             recording, std = add_network_answers(cloth, recording, network)
             noise = {"markers": std, **(noise or {})}
@@ -249,7 +251,8 @@ def _standard_errors(
     )
     variance = variance.reshape(x.shape) + considered.square().sum(0) + fine_std.square().unsqueeze(-1)
     if any(map(len, used.clouds)):
-        slow_std = SLOW_DEPTH_ERROR_STD_M if stated is None else min(stated, SLOW_DEPTH_ERROR_STD_M)
+        unknown = max(SLOW_DEPTH_ERROR_STD_M, SLOW_DEPTH_ERROR_RATIO * _point_noise(objective, used, smoothed))
+        slow_std = unknown if stated is None else min(stated, SLOW_DEPTH_ERROR_STD_M)
         faces = objective.faces.numpy()
         normals = torch.as_tensor(np.stack([vertex_normals(frame, faces) for frame in x.numpy()]))
         variance = variance + slow_std**2 * normals.square()
