@@ -17,7 +17,6 @@ from torchcloth.meshes import Mesh
 MAX_POINT_ERROR_M = 2e-3  # rms: noise of 1 mm, images in mm
 MAX_CORNER_ERROR_M = 0.012  # a pixel at 1 m
 MAX_CLOCK_ERROR_S = 0.01
-pytestmark = pytest.mark.filterwarnings("error")
 
 
 @pytest.fixture(scope="module")
