@@ -100,8 +100,8 @@ def test_a_sheet_in_two_hands_becomes_an_episode_on_the_clock_of_the_joints(two_
 
 @pytest.mark.slow
 def test_identify_accepts_a_new_episode(two_arms, tmp_path, capsys):
-    assert main(["new", str(tmp_path / "episode"), *two_arms.options, "--mass", "0.056"]) == 0
-    fit = ["--fit", "air.normal", "--iterations", "2", "--out", str(tmp_path / "fit")]
+    assert main(["new", str(tmp_path / "episode"), *two_arms.options, "--mass", "0.056", "--span", "0", "0.7"]) == 0
+    fit = ["--fit", "air.normal", "--iterations", "1", "--out", str(tmp_path / "fit")]
     assert main(["identify", str(tmp_path / "episode"), *fit]) == 0
     assert json.loads((tmp_path / "fit" / "identification.json").read_text())["parameters"]["air.normal"]
 
