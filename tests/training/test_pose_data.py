@@ -18,15 +18,16 @@ from torchcloth.losses import find_closest_points
 from torchcloth.meshes import rectangle
 from torchcloth.observe import DepthCamera, DepthNoise, look_at
 from torchcloth.training.pose import clouds, data, scenes
+from torchcloth.training.pose import motions as pose_motions
 
 TABLE_SEED, HANGING_SEED = 24, 72  # a sheet that is lifted from a table by a corner; one that hangs by two
-FAST_DATA = {"schema": np.array(data.DATA_SCHEMA), "rejected": np.array("")}
+FAST_DATA = {"schema": np.array(pose_motions.DATA_SCHEMA), "rejected": np.array("")}
 
 
 @pytest.fixture(scope="module")
 def motions() -> dict[int, dict[str, Any]]:
     """Motions of two seeds of the training."""
-    return {seed: data.make_motion(seed, "train") for seed in (TABLE_SEED, HANGING_SEED)}
+    return {seed: pose_motions.make_motion(seed, "train") for seed in (TABLE_SEED, HANGING_SEED)}
 
 
 @pytest.fixture(scope="module")
@@ -34,13 +35,13 @@ def samples(motions, tmp_path_factory) -> list[data.PoseSample]:
     """All samples of these motions, through their files."""
     folder = tmp_path_factory.mktemp("motions")
     for seed, motion in motions.items():
-        np.savez(data.motion_path(folder, seed), **motion)
+        np.savez(pose_motions.motion_path(folder, seed), **motion)
     dataset = data.PoseDataset(folder)
     return [dataset[k] for k in range(len(dataset))]
 
 
 def test_the_same_seed_makes_the_same_motion(motions):
-    again = data.make_motion(TABLE_SEED, "train")
+    again = pose_motions.make_motion(TABLE_SEED, "train")
     assert again.keys() == motions[TABLE_SEED].keys()
     for name, value in motions[TABLE_SEED].items():
         if value.dtype.kind == "f":  # a matrix product may depend on where its operands lie in memory
@@ -161,49 +162,49 @@ def fast_data(monkeypatch) -> list[int]:
         empty = np.zeros((2, 1, 3))
         return FAST_DATA | {"times": np.zeros(2), "points": empty, "x": empty}
 
-    monkeypatch.setattr(data, "make_motion", make_motion)
+    monkeypatch.setattr(pose_motions, "make_motion", make_motion)
     return made
 
 
 def test_a_stopped_command_goes_on_where_it_was(fast_data, tmp_path, capsys):
     out = tmp_path / "data"
-    assert data.main(["--out", str(out), "--motions", "4"]) == 0
+    assert pose_motions.main(["--out", str(out), "--motions", "4"]) == 0
     assert "4/4 motions (100%), 8 samples" in capsys.readouterr().out
-    assert data.main(["--out", str(out), "--motions", "6"]) == 0
+    assert pose_motions.main(["--out", str(out), "--motions", "6"]) == 0
     assert fast_data == [0, 1, 2, 3, 4, 5]
     assert {path.name for path in out.iterdir()} == {"data.json", *(f"motion_{k:06d}.npz" for k in range(6))}
 
 
 def test_a_damaged_file_is_refused_with_its_name(fast_data, tmp_path, capsys):
     out = tmp_path / "data"
-    data.main(["--out", str(out), "--motions", "2"])
-    path = data.motion_path(out, 1)
+    pose_motions.main(["--out", str(out), "--motions", "2"])
+    path = pose_motions.motion_path(out, 1)
     path.write_bytes(path.read_bytes()[:300])
     capsys.readouterr()
-    assert data.main(["--out", str(out), "--motions", "3"]) == 2
+    assert pose_motions.main(["--out", str(out), "--motions", "3"]) == 2
     message = capsys.readouterr().err
     assert message.count("\n") == 1
     assert f"{path}: damaged" in message
     with pytest.raises(RecordingError, match=r"motion_000001\.npz: damaged.*delete it"):
-        data.load_motion(path)
+        pose_motions.load_motion(path)
 
 
 def test_a_folder_of_another_split_is_refused(fast_data, tmp_path, capsys):
-    data.main(["--out", str(tmp_path), "--motions", "1"])
-    assert data.main(["--out", str(tmp_path), "--motions", "1", "--split", "held-out"]) == 2
+    pose_motions.main(["--out", str(tmp_path), "--motions", "1"])
+    assert pose_motions.main(["--out", str(tmp_path), "--motions", "1", "--split", "held-out"]) == 2
     assert "held-out" in capsys.readouterr().err
     with pytest.raises(InvalidInput, match="--motions"):
-        data.make_data(tmp_path, 0, "train")
+        pose_motions.make_data(tmp_path, 0, "train")
 
 
 def test_files_of_another_schema_and_pickles_are_refused(tmp_path):
     path = tmp_path / "motion_000000.npz"
     np.savez(path, **FAST_DATA | {"schema": np.array("other/1"), "times": [], "points": np.zeros((0, 1)), "x": []})
     with pytest.raises(RecordingError, match="schema; got other/1"):
-        data.load_motion(path)
+        pose_motions.load_motion(path)
     np.savez(path, **FAST_DATA, times=np.array([None]))
     with pytest.raises(RecordingError, match="damaged"):
-        data.load_motion(path)
+        pose_motions.load_motion(path)
     with pytest.raises(InvalidInput, match="without motions"):
         data.PoseDataset(tmp_path / "nowhere")
 
@@ -263,8 +264,8 @@ def test_each_epoch_serves_every_sample_once_in_another_order_with_little_paddin
 
 def test_the_data_module_serves_reproducible_batches(motions, tmp_path):
     for seed, motion in motions.items():
-        np.savez(data.motion_path(tmp_path, seed), **motion)
-    np.savez(data.motion_path(tmp_path, 99), **{**FAST_DATA, "rejected": np.array("diverged")})
+        np.savez(pose_motions.motion_path(tmp_path, seed), **motion)
+    np.savez(pose_motions.motion_path(tmp_path, 99), **{**FAST_DATA, "rejected": np.array("diverged")})
     first, second = (
         list(data.PoseDataModule(tmp_path, 8, validation_folder=tmp_path, seed=5).train_dataloader()) for _ in range(2)
     )

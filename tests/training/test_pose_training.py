@@ -20,8 +20,9 @@ from torchcloth.pose.first_shape import load_network
 from torchcloth.pose.network import PoseEstimator, PoseNetworkConfig
 from torchcloth.training.pose import train
 from torchcloth.training.pose.command import main
-from torchcloth.training.pose.data import PoseDataset, collate, make_data
+from torchcloth.training.pose.data import PoseDataset, collate
 from torchcloth.training.pose.module import PoseLossWeights, PoseTraining
+from torchcloth.training.pose.motions import make_data
 from torchcloth.training.pose.physics_loss import PhysicsLoss
 from torchcloth.training.pose.train import evaluate
 from torchcloth.training.pose.unlabelled import write_unlabelled

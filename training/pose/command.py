@@ -38,7 +38,7 @@ def _train(options: argparse.Namespace) -> None:
     from torchcloth import recordings
     from torchcloth.pose import PoseEstimator, PoseNetworkConfig, load_network
 
-    from .data import make_data
+    from .motions import make_data
     from .train import NETWORK_FILE, TrainingPlan, train
     from .unlabelled import write_unlabelled
 

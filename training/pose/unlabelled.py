@@ -17,7 +17,7 @@ from torchcloth.pose.network_answers import MIN_POINTS_FOR_NETWORK
 from torchcloth.pose.scene_frame import rest_coordinates
 from torchcloth.recordings import Recording
 
-from .data import DATA_SCHEMA, MOTION_KNOT_PERIOD_S, motion_path
+from .motions import DATA_SCHEMA, MOTION_KNOT_PERIOD_S, motion_path
 from .scenes import FABRIC_RANGES, Fabric
 
 Array = np.ndarray
