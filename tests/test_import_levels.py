@@ -29,7 +29,7 @@ LEVELS = (
     ("pose",),
     ("diagnosis",),
     ("planning",),
-    ("authoring", "synthesis", "viewing"),
+    ("authoring", "export", "synthesis", "viewing"),
     ("",),  # torchcloth/__init__.py: the names a user sees
     ("training",),
     ("benchmarks",),

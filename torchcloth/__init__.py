@@ -19,7 +19,7 @@ from .simulation.sensitivities import Directions
 from .types import ClothState, Rollout, Trajectory
 
 if TYPE_CHECKING:
-    from . import diagnosis, identification, observe, planning, pose, recordings, robots
+    from . import diagnosis, export, identification, observe, planning, pose, recordings, robots
     from .diagnosis import diagnose, load
     from .identification import identify
     from .planning import plan
@@ -41,6 +41,7 @@ __all__ = [
     "effects",
     "errors",
     "estimate_pose",
+    "export",
     "identification",
     "identify",
     "load",
@@ -55,7 +56,7 @@ __all__ = [
     "robots",
 ]
 
-LAZY_SUBPACKAGES = ("diagnosis", "identification", "observe", "planning", "pose", "recordings", "robots")
+LAZY_SUBPACKAGES = ("diagnosis", "export", "identification", "observe", "planning", "pose", "recordings", "robots")
 LAZY_FUNCTIONS = {
     "diagnose": "diagnosis",
     "estimate_pose": "pose",

@@ -16,7 +16,22 @@ from typing import Any, NoReturn
 
 from .._utils.files import DISK_FULL_ERROR_NUMBERS
 from ..errors import InvalidInput, TorchclothError, to_message_part
-from . import bench, confirm, convert, diagnose, doctor, identify, inspect, new, plan, pose, predict, simulate, view
+from . import (
+    bench,
+    confirm,
+    convert,
+    diagnose,
+    doctor,
+    export,
+    identify,
+    inspect,
+    new,
+    plan,
+    pose,
+    predict,
+    simulate,
+    view,
+)
 
 VERBS = (
     identify,
@@ -25,6 +40,7 @@ VERBS = (
     diagnose,
     confirm,
     plan,
+    export,
     inspect,
     view,
     new,
@@ -41,6 +57,7 @@ VERBS_WITH_CAUSES = (
     "confirm",
     "plan",
     "view",
+    "export",
 )  # verbs that read model files, which may hold causes of the user's own
 
 

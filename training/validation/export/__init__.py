@@ -1,0 +1,1 @@
+"""Exported cloths, simulated by the engines that they were exported to."""
