@@ -24,7 +24,7 @@ from .hinges import Hinges, find_hinges
 from .report import Export, Parameter, describe_direction_spread
 from .sheet import Sheet
 
-STEP_SAFETY_FACTOR = 0.5  # of the stability limit at rest: a stretched sheet is stiffer
+STEP_OVER_STABILITY_LIMIT = 0.5  # of the stability limit at rest: a stretched sheet is stiffer
 MIN_INERTIA_AREA_M2 = 1e-10  # of a vertex without drag: MuJoCo wants a positive inertia
 CONTACT_RADIUS_OVER_THICKNESS = 0.5
 
@@ -87,7 +87,7 @@ def max_stable_step(sheet: Sheet, hinges: Hinges, weights: np.ndarray, damping: 
     start = np.cos(np.arange(3.0 * len(sheet.mass)) ** 2)  # the same at every call
     omega = math.sqrt(eigsh(scale @ stiffness @ scale, k=1, v0=start, return_eigenvectors=False)[0])
     zeta = damping * omega / 2
-    return STEP_SAFETY_FACTOR * 2 / omega * (math.sqrt(1 + zeta**2) - zeta)
+    return STEP_OVER_STABILITY_LIMIT * 2 / omega * (math.sqrt(1 + zeta**2) - zeta)
 
 
 def _membrane_matrix(sheet: Sheet) -> csr_array:

@@ -1,4 +1,4 @@
-"""The exported MJCF file in MuJoCo, with the held vertices on the grippers' path."""
+"""The exported MJCF file in MuJoCo, with the gripped vertices on the grippers' path."""
 
 from __future__ import annotations
 
@@ -49,13 +49,13 @@ def replay_in_mujoco(
     for end in swing.t[1:]:
         steps = int(np.ceil((end - t) / model.opt.timestep - 1e-9))
         model.opt.timestep = dt = (end - t) / steps
-        path = swing.path(t + dt * np.arange(1, steps + 1)) - rest[swing.held]
+        path = swing.path(t + dt * np.arange(1, steps + 1)) - rest[swing.gripped]
         for target in path:
-            v[swing.held] = (target - q[swing.held]) / dt
+            v[swing.gripped] = (target - q[swing.gripped]) / dt
             if air is not None:
                 data.qfrc_applied[:] = air.force(q + rest, v).ravel()
             mujoco.mj_step(model, data)
-            q[swing.held] = target
+            q[swing.gripped] = target
         if not np.isfinite(q).all() or any(warning.number for warning in data.warning):
             raise SimulationDiverged("MuJoCo's cloth", got=f"a state that is not finite by {end:.3f} s")
         t = end

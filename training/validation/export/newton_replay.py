@@ -1,4 +1,4 @@
-"""The exported JSON file in Newton on the CPU, with the held vertices on the grippers' path."""
+"""The exported JSON file in Newton on the CPU, with the gripped vertices on the grippers' path."""
 
 from __future__ import annotations
 
@@ -20,8 +20,8 @@ except ImportError:
 VBD_ITERATIONS = 10
 
 
-def build_model(content: dict, solver: str, held: Array) -> Any:
-    """Return Newton's model of an exported cloth on the CPU, with the held vertices without inverse mass."""
+def build_model(content: dict, solver: str, gripped: Array) -> Any:
+    """Return Newton's model of an exported cloth on the CPU, with the gripped vertices without inverse mass."""
     wp.config.quiet = True
     builder = newton.ModelBuilder(up_axis=newton.Axis.Z, gravity=tuple(content["gravity"]))
     builder.add_cloth_mesh(
@@ -34,7 +34,7 @@ def build_model(content: dict, solver: str, held: Array) -> Any:
         **content["arguments"][solver],
     )
     builder.particle_mass = list(content["particle_mass"])
-    for i in held:
+    for i in gripped:
         builder.particle_mass[i] = 0.0
     if solver == "SolverVBD":
         builder.color(include_bending=True)
@@ -59,7 +59,7 @@ def replay_in_newton(text: str, swing: Swing, solver: str, step: float, has_drag
     if not has_drag:
         content["arguments"][solver]["tri_drag"] = 0.0
     air = make_still_air(swing) if has_drag and solver == "SolverVBD" else None
-    model = build_model(content, solver, swing.held)
+    model = build_model(content, solver, swing.gripped)
     model.particle_grid = None  # no contact
     if solver == "SolverVBD":
         solve = newton.solvers.SolverVBD(model, iterations=VBD_ITERATIONS, particle_enable_self_contact=False)
@@ -73,8 +73,8 @@ def replay_in_newton(text: str, swing: Swing, solver: str, step: float, has_drag
         dt = (end - t) / steps
         path = swing.path(t + dt * np.arange(steps + 1)).astype(np.float32)
         for k in range(steps):
-            now.particle_q.numpy()[swing.held] = path[k]  # views of memory on the CPU
-            now.particle_qd.numpy()[swing.held] = (path[k + 1] - path[k]) / dt
+            now.particle_q.numpy()[swing.gripped] = path[k]  # views of memory on the CPU
+            now.particle_qd.numpy()[swing.gripped] = (path[k + 1] - path[k]) / dt
             now.clear_forces()
             if air is not None:
                 now.particle_f.assign(air.force(now.particle_q.numpy(), now.particle_qd.numpy()).astype(np.float32))
@@ -82,7 +82,7 @@ def replay_in_newton(text: str, swing: Swing, solver: str, step: float, has_drag
             now, after = after, now
         t = end
         frames.append(now.particle_q.numpy().astype(float))
-        frames[-1][swing.held] = path[-1]
+        frames[-1][swing.gripped] = path[-1]
     return np.stack(frames)
 
 

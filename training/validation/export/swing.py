@@ -41,26 +41,26 @@ class Swing:
         cloth: what moved.
         t: [T] s, frame times.
         x: [T, V, 3] m.
-        held: [H] vertices that the grippers hold.
+        gripped: [H] vertices that the grippers hold.
         path_t: [K] s.
-        path_x: [K, H, 3] m, positions of the held vertices.
+        path_x: [K, H, 3] m, positions of the gripped vertices.
     """
 
     cloth: Cloth
     t: Array
     x: Array
-    held: Array
+    gripped: Array
     path_t: Array
     path_x: Array
 
     @cached_property
     def path(self) -> CubicSpline:
-        """Positions [H, 3] m of the held vertices as a function of time [s]."""
+        """Positions [H, 3] m of the gripped vertices as a function of time [s]."""
         return CubicSpline(self.path_t, self.path_x)
 
     def rms_distance(self, x: Array) -> float:
         """Return the root mean square distance [m] of positions [T, V, 3] m of the free vertices."""
-        free = np.setdiff1d(np.arange(self.x.shape[1]), self.held)
+        free = np.setdiff1d(np.arange(self.x.shape[1]), self.gripped)
         return float(np.sqrt(((x - self.x)[:, free] ** 2).sum(-1).mean()))
 
     def max_distance(self, x: Array) -> float:
@@ -102,5 +102,5 @@ def simulate_swing(cloth: Cloth, recording: Recording, seconds: float | None = N
         state = cloth.settle(first_state(cloth, episode), episode.motion, start=float(times[0]), duration=SETTLE_TIME_S)
         x = cloth(state, episode.motion, torch.as_tensor(dense)).x.numpy()
     grasps: Any = cloth.boundaries
-    held = np.concatenate([grasp.index.numpy() for grasp in grasps.values()])
-    return Swing(cloth, times, x[np.searchsorted(dense, times - 1e-9)], held, dense, x[:, held])
+    gripped = np.concatenate([grasp.index.numpy() for grasp in grasps.values()])
+    return Swing(cloth, times, x[np.searchsorted(dense, times - 1e-9)], gripped, dense, x[:, gripped])
