@@ -12,11 +12,14 @@ import torchcloth as tc
 from torchcloth import recordings
 from torchcloth.errors import RecordingError
 from torchcloth.identification import build_cloth, build_episode
+from torchcloth.meshes import rectangle
 from torchcloth.observe.align import edge_strain
-from torchcloth.pose import estimate_first_shape
+from torchcloth.pose import FirstShape, estimate_first_shape
+from torchcloth.pose.first_shape import _rival_distance
 
 EXAMPLE = Path(tc.__file__).with_name("examples") / "bimanual_swing"
 MEASURED_SHAPE_DISTANCE_M = 0.01
+SIDE_M = 0.3
 GRIP_RADIUS_M = 0.03  # reaches beyond the nearest row of vertices, which the mesh moves to its edge
 
 
@@ -43,3 +46,17 @@ def test_a_shape_that_no_cloth_has_is_refused(scene):
         recording = replace(scene.recording, grasps=grasps)
         with pytest.raises(RecordingError, match="strained by"):
             estimate_first_shape(build_cloth(recording), recording)
+
+
+def test_a_shape_that_the_clouds_do_not_tell_from_another_is_said_to_be_one_of_several():
+    mesh = rectangle(SIDE_M, SIDE_M, triangles=8)
+    x = torch.as_tensor(mesh.vertices)
+    hypotheses, one = torch.stack([x, x + 0.001, x + SIDE_M, x - 2 * SIDE_M]), torch.ones(4)
+
+    def warnings(distances: list[float]) -> list[str]:
+        rival = _rival_distance(hypotheses, torch.tensor(distances), 0)
+        return FirstShape(mesh, x, one, None, torch.tensor(distances), one, rival).warnings
+
+    (warning,) = warnings([2e-3, 2e-3, 2.8e-3, 4e-3])
+    assert f"{1e3 * SIDE_M * 3**0.5:.0f} mm away" in warning
+    assert not warnings([2e-3, 2e-3, 4e-3, float("nan")])

@@ -49,5 +49,7 @@ def estimate_first_shapes(
     for episode, shape in zip(episodes, shapes, strict=True):
         name = episode.path.name if episode.path else "episode"
         print(f"{name}: first shape by the network, standard error {1e3 * shape.std_rms:.1f} mm")
+        for warning in shape.warnings:
+            print(f"warning: {name}: {warning}")
     recordings = [shape.apply(episode) for shape, episode in zip(shapes, episodes, strict=True)]
     return recordings, max(shape.std_rms for shape in shapes)

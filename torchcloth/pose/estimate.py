@@ -118,7 +118,7 @@ def estimate_pose(
     if start != "recording":
         network = _network_of(start)
         shape = estimate_first_shape(cloth, recording, network)
-        recording = shape.apply(recording)
+        recording, notes = shape.apply(recording), [*notes, *shape.warnings]
         nuisances = {"shape": shape.std_rms, "grasp": CONSIDERED_GRIP_STD_M, "grasp_turn": None, **nuisances}
         if recording.markers is None and use is None and cloth.mesh.uv is not None:
             recording, std = add_network_answers(cloth, recording, network)

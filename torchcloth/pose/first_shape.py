@@ -36,6 +36,12 @@ MAX_PARABOLA_RESIDUAL_M = 0.01  # rms over vertices, above which answers jump fr
 VELOCITY_STEP_S = 0.01  # of the difference that gives a gripper's velocity
 SINGLE_CLOUD_PERIOD_S = 1e-3
 SIMULATED_FRAMES = 6  # with which hypotheses are compared
+MAX_RIVAL_RATIO = (
+    1.5  # of the distance from the clouds to that of the best hypothesis, for one that may be true as well
+)
+MAX_RIVAL_DISTANCE_RATIO = (
+    0.1  # of the distance from such a hypothesis to the cloth's extent, above which it is another
+)
 MAX_NETWORK_BYTES = 50_000_000
 
 
@@ -50,6 +56,8 @@ class FirstShape(NamedTuple):
         distances: [S] m, distance of the first cloud from each hypothesis, before it was moved to the cloud, and the
             mean distance of the next clouds from its simulation, averaged; NaN: the simulation diverged.
         weights: [S], what the network gave each hypothesis.
+        rival_distance: root mean square distance [m] of the hypothesis that is farthest from ``x`` among those that
+            follow the clouds almost as well; 0: there is none.
     """
 
     mesh: Mesh
@@ -58,6 +66,18 @@ class FirstShape(NamedTuple):
     v: Tensor | None
     distances: Tensor
     weights: Tensor
+    rival_distance: float
+
+    @property
+    def warnings(self) -> list[str]:
+        """A warning where the clouds do not tell the shape from another one."""
+        if not self.rival_distance > MAX_RIVAL_DISTANCE_RATIO * self.mesh.extent:
+            return []
+        return [
+            f"the first shape is one of several: another one, {1e3 * self.rival_distance:.0f} mm away (rms), follows "
+            "the first clouds almost as well, and no standard error says so; hold the cloth at two places, or give "
+            "cloth.initial_vertices"
+        ]
 
     @property
     def std_rms(self) -> float:
@@ -168,9 +188,9 @@ def pose_inputs(
     before = rest.new_full((len(rest), 3), torch.nan).float() if previous is None else previous.float()
     parts = (cloud[drawn[:POINTS_SEEN]].float(), rest.float(), torch.ones(len(rest), dtype=torch.bool), grip)
     inputs = PoseInputs(*(part.unsqueeze(0) for part in (*parts, position, velocity, before)))
-    frame = build_scene_frame(inputs)
-    hanging = frame.hang(torch.einsum("bij,bkj->bki", frame.rest_axes, offset[None]))
-    return inputs._replace(grip_position=inputs.grip_position + frame.turn_to_world(hanging))
+    scene = build_scene_frame(inputs)
+    hanging = scene.hang(torch.einsum("bij,bkj->bki", scene.rest_axes, offset[None]))
+    return inputs._replace(grip_position=inputs.grip_position + scene.turn_to_world(hanging))
 
 
 def find_grippers(cloth: Cloth, rest: Tensor) -> list[str]:
@@ -218,7 +238,8 @@ def estimate_first_shape(
         )
         now = _distances_now(cloth, episode, hypotheses)
         if is_single:
-            return FirstShape(cloth.mesh, hypotheses[0], std[0], None, now, weights)
+            rival = _rival_distance(hypotheses, now, 0)
+            return FirstShape(cloth.mesh, hypotheses[0], std[0], None, now, weights, rival)
         velocities = _velocities(network, cloth, episode, rest, first, hypotheses)
         gripped = inputs.grip[0].nonzero()[:, 0]
         states = [
@@ -239,7 +260,15 @@ def estimate_first_shape(
             expected=f"at most {MAX_EDGE_STRAIN:g}",
             remedy="check that the gripper's frame lies where it holds the cloth; else give cloth.initial_vertices",
         )
-    return FirstShape(cloth.mesh, hypotheses[best], std[best], velocities[best], distances, weights)
+    rival = _rival_distance(hypotheses, distances, best)
+    return FirstShape(cloth.mesh, hypotheses[best], std[best], velocities[best], distances, weights, rival)
+
+
+def _rival_distance(hypotheses: Tensor, distances: Tensor, best: int) -> float:
+    """Largest rms distance [m] from hypothesis ``best`` of those [S, V, 3] whose distances [S] are almost as small."""
+    is_rival = distances <= MAX_RIVAL_RATIO * distances[best]
+    apart = (hypotheses - hypotheses[best]).square().sum(-1).mean(-1).sqrt()
+    return float(apart[is_rival].max()) if bool(is_rival.any()) else 0.0
 
 
 def without_first_shape(recording: Recording) -> Recording:
