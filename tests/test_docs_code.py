@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 import torch
 from helpers import foreign_formats
+from helpers.arm_view import write_arm_view
 from helpers.bench_files import write_bar
 
 import torchcloth as tc
@@ -28,6 +29,7 @@ PREPARE: dict[str, Callable[[Path], dict[str, Any]]] = {}  # page: files and nam
 CHECK: dict[str, Callable[[dict[str, Any]], None]] = {}  # page: what must hold after its blocks
 SLOW_PAGES = {  # they take ten seconds and more
     "docs/how-to/new-episode.md",
+    "docs/how-to/record.md",
     "docs/how-to/simulate-recordings.md",
     "docs/tutorials/from-depth-images-to-a-fabric.md",
     "docs/tutorials/plan-an-arm-motion.md",
@@ -69,7 +71,13 @@ def prepare_bench(folder: Path) -> dict[str, Any]:
     return {}
 
 
+def prepare_arm_view(folder: Path) -> dict[str, Any]:
+    """Write an episode with an arm in the view of its camera."""
+    return {"truth": write_arm_view(folder / "my_episode")[1]}
+
+
 PREPARE |= {
+    "docs/how-to/record.md": prepare_arm_view,
     "docs/how-to/own-arm.md": prepare_arm,
     "docs/how-to/import-recordings.md": prepare_depth_images,
     "docs/how-to/new-episode.md": prepare_bench,
@@ -129,7 +137,12 @@ def check_tutorial(namespace: dict[str, Any]) -> None:
     assert min(episode.require("points").counts) > 1500
 
 
+def check_arm_view(namespace: dict[str, Any]) -> None:
+    np.testing.assert_allclose(namespace["pose"].T_world_camera, namespace["truth"], atol=5e-3)
+
+
 CHECK |= {
+    "docs/how-to/record.md": check_arm_view,
     "docs/how-to/use-the-layer.md": check_shirt,
     "README.md": check_layer,
     "docs/how-to/own-arm.md": check_arm,

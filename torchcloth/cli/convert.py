@@ -38,6 +38,11 @@ def add(verbs: Any) -> None:
     convert.add_argument(
         "--episode", type=int, metavar="N", help="number of the episode, if SRC holds several (LeRobot)"
     )
+    convert.add_argument(
+        "--camera-from-arm",
+        metavar="CAM",
+        help="find the pose of this camera from the arms in its view; its pose in SRC or in the scene may be a guess",
+    )
     convert.add_argument("--overwrite", action="store_true", help="replace DST if it exists")
     convert.set_defaults(run=_convert, stopped="; nothing was written")
 
@@ -52,12 +57,42 @@ def _convert(options: argparse.Namespace) -> int:
     _check_target(options)
     with Console(stderr=True).status(escape(f"reading {options.source}")):  # prints nothing if stderr is no terminal
         recording = formats.read(options.source, format=options.format, scene=options.scene, episode=options.episode)
+    if options.camera_from_arm is not None:
+        recording = _with_pose_from_arm(recording, options.camera_from_arm)
     write = formats.write_mcap if options.target.suffix == MCAP_SUFFIX else recordings.write
     _with_progress(
         recording, lambda on_image: write(recording, options.target, overwrite=options.overwrite, on_image=on_image)
     )
     _report(recording, options.target)
     return 0
+
+
+def _with_pose_from_arm(recording: Recording, name: str) -> Recording:
+    """Return the recording with the camera's pose found from the arms, and print it."""
+    from dataclasses import replace
+
+    from ..inspection import find_camera_pose_from_arms
+    from ..inspection.camera_from_arm import describe_camera_pose
+
+    if recording.points is not None:
+        raise InvalidInput(
+            "--camera-from-arm",
+            got="a recording with points, which the pose that it has placed in the world",
+            expected="depth images without points",
+            remedy="leave the points out, and cut the cloth out of the depth images with the new pose",
+        )
+    guess = recording.cameras[name].T_world_camera if name in recording.cameras else None
+    pose = find_camera_pose_from_arms(recording, name, guess)
+    print(f"{name}: {describe_camera_pose(pose, guess)}")
+    if not pose.is_determined:
+        raise InvalidInput(
+            "--camera-from-arm",
+            got="a pose that the images do not determine",
+            expected="standard errors below 30 mm and 1.7 degrees",
+            remedy="record more postures of the arm, nearer to the camera",
+        )
+    camera = replace(recording.cameras[name], T_world_camera=pose.T_world_camera)
+    return replace(recording, cameras={**recording.cameras, name: camera})
 
 
 def _check_target(options: argparse.Namespace) -> None:

@@ -25,6 +25,11 @@ def add(verbs: Any) -> None:
     )
     inspect.add_argument("episode", metavar="EPISODE", help="folder of a recording")
     inspect.add_argument("--out", type=output_path, metavar="DIR", help="also write inspection.json and inspection.png")
+    inspect.add_argument(
+        "--camera-from-arm",
+        metavar="CAM",
+        help="find this camera's pose from the arms in its view, and print how far the recorded one is off",
+    )
     inspect.add_argument("--json", action="store_true", help="print inspection.json instead of tables")
     inspect.set_defaults(run=_inspect)
 
@@ -42,7 +47,8 @@ def _inspect(options: argparse.Namespace) -> int:
         recording = recordings.read(options.episode)
         report = inspection.inspect(recording)
         problems, warnings = check_for_fit(recording)
-    report = replace(report, notes=[*report.notes, *warnings])
+        pose = _find_pose(recording, options.camera_from_arm)
+    report = replace(report, notes=[*report.notes, *warnings, *pose])
     text = json.dumps(report.as_dict(), indent=1, allow_nan=False) + "\n"
     written = ""
     if options.out is not None:  # before printing, which fails if the reader closes the pipe
@@ -55,6 +61,17 @@ def _inspect(options: argparse.Namespace) -> int:
         inspection.show(report)
         print(f"{written}verdict: {describe_verdict(problems, report.notes)}")
     return 0
+
+
+def _find_pose(recording: Recording, camera: str | None) -> list[str]:
+    """Return a note on the pose of a camera from the arms in its view."""
+    from ..inspection import find_camera_pose_from_arms
+    from ..inspection.camera_from_arm import describe_camera_pose
+
+    if camera is None:
+        return []
+    recorded = recording.cameras[camera].T_world_camera if camera in recording.cameras else None
+    return [f"{camera}: {describe_camera_pose(find_camera_pose_from_arms(recording, camera, recorded), recorded)}"]
 
 
 def check_for_fit(recording: Recording) -> tuple[list[str], list[str]]:

@@ -6,6 +6,7 @@ inspection.draw(report, "out/ep_01")
 """
 
 from ..recordings.timing import StreamTiming
+from .camera_from_arm import find_camera_pose_from_arms
 from .depth_images import DepthSummary
 from .frame_checks import FrameChecks
 from .inspect_recording import Inspection, inspect
@@ -22,6 +23,7 @@ __all__ = [
     "NoiseEstimate",
     "StreamTiming",
     "draw",
+    "find_camera_pose_from_arms",
     "inspect",
     "show",
 ]

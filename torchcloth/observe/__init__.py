@@ -5,6 +5,7 @@ To a camera a cloth is one more triangle mesh; only ``align`` knows its pattern.
 
 from .align import Alignment, align
 from .camera import DepthCamera, look_at
+from .camera_pose import CameraPose, CameraPosePriors, find_camera_pose
 from .cloud import erode, thin_to_count, thin_to_spacing, to_points
 from .lens import Lens
 from .noise import AbstractNoise, DepthNoise, mask_depth_edges
@@ -18,6 +19,8 @@ from .view import Capture, View, capture, decode_depth, encode_depth
 __all__ = [
     "AbstractNoise",
     "Alignment",
+    "CameraPose",
+    "CameraPosePriors",
     "Capture",
     "DepthCamera",
     "DepthNoise",
@@ -33,6 +36,7 @@ __all__ = [
     "decode_depth",
     "encode_depth",
     "erode",
+    "find_camera_pose",
     "look_at",
     "mask_depth_edges",
     "mask_steep_pixels",

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from importlib import import_module
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -12,6 +12,20 @@ from ..errors import InvalidInput, MissingDependency
 from .camera import DepthCamera
 
 Array = np.ndarray
+
+
+class Surfaces(NamedTuple):
+    """What the pixels of a camera see.
+
+    Attributes:
+        depth: [H, W] float32 m along the optical axis, 0 where nothing is seen.
+        ids: [H, W] int32, index of the body; -1 where there is none or it is out of range.
+        normals: [H, W, 3] float32, of the triangle in the world, as its corners say; 0 where nothing is seen.
+    """
+
+    depth: Array
+    ids: Array
+    normals: Array
 
 
 def render_depth(camera: DepthCamera, meshes: Sequence[tuple[Array, Array]]) -> tuple[Array, Array]:
@@ -32,6 +46,12 @@ def render_depth(camera: DepthCamera, meshes: Sequence[tuple[Array, Array]]) -> 
         MissingDependency: open3d cannot be imported.
         InvalidInput: a mesh that has the wrong shape, an index out of bounds or a vertex that is not finite.
     """
+    surfaces = render_surfaces(camera, meshes)
+    return surfaces.depth, surfaces.ids
+
+
+def render_surfaces(camera: DepthCamera, meshes: Sequence[tuple[Array, Array]]) -> Surfaces:
+    """Render depth, bodies and normals; see ``render_depth``."""
     o3d = import_open3d()
     scene = o3d.t.geometry.RaycastingScene()
     body = []
@@ -42,8 +62,9 @@ def render_depth(camera: DepthCamera, meshes: Sequence[tuple[Array, Array]]) -> 
         scene.add_triangles(o3d.core.Tensor(vertices), o3d.core.Tensor(faces))
         body.append(index)
     origin, directions = camera.rays()
+    size = directions.shape[:2]
     if not body:
-        return np.zeros(directions.shape[:2], np.float32), np.full(directions.shape[:2], -1, np.int32)
+        return Surfaces(np.zeros(size, np.float32), np.full(size, -1, np.int32), np.zeros((*size, 3), np.float32))
     has_ray = np.isfinite(directions[..., :1])
     rays = np.concatenate([np.broadcast_to(origin, directions.shape), np.where(has_ray, directions, 1.0)], -1)
     hit = scene.cast_rays(o3d.core.Tensor(np.ascontiguousarray(rays, np.float32)))
@@ -51,7 +72,8 @@ def render_depth(camera: DepthCamera, meshes: Sequence[tuple[Array, Array]]) -> 
     seen = np.isfinite(depth) & (depth >= camera.range[0]) & (depth <= camera.range[1]) & has_ray[..., 0]
     ids = np.full(depth.shape, -1, np.int32)
     ids[seen] = np.array(body, np.int32)[geometry[seen]]
-    return np.where(seen, depth, 0).astype(np.float32), ids
+    normals = np.where(seen[..., None], hit["primitive_normals"].numpy(), 0)
+    return Surfaces(np.where(seen, depth, 0).astype(np.float32), ids, normals)
 
 
 def _validate_mesh(index: int, vertices: Array, faces: Array) -> tuple[Array, Array]:

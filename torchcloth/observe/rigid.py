@@ -58,7 +58,7 @@ def register_rigidly(x: Tensor, faces: Tensor, points: Tensor) -> list[Pose]:
         weights = [
             d.new_full(d.shape, 1 / d.shape[-1]) / (1 + (d / PAIR_DISTANCE_SCALE_M) ** 2) for d in (to_point, to_vertex)
         ]
-        pose = _kabsch(source, target, torch.cat(weights, dim=-1))
+        pose = fit_pose(source, target, torch.cat(weights, dim=-1))
     surface, scoring_sample = torch.cat([x, x[faces].mean(1)]), _sample(points, SCORING_POINTS)
     score = torch.stack([_misfit(one.transform(surface), scoring_sample) for one in map(Pose, *pose)])
     return _shortlist(pose, score, _axes(x)[:, 2])
@@ -116,8 +116,14 @@ def _axes(x: Tensor) -> Tensor:
     return axes * x.new_tensor([1.0, 1.0, float(torch.linalg.det(axes).sign())])
 
 
-def _kabsch(source: Tensor, target: Tensor, weight: Tensor) -> Pose:
-    """The rigid motions [S] of weighted least squares from source to target [S, N, 3] (Kabsch 1976)."""
+def fit_pose(source: Tensor, target: Tensor, weight: Tensor) -> Pose:
+    """Compute the rigid motions [S] of weighted least squares from source to target points (Kabsch 1976).
+
+    Args:
+        source: [S, N, 3] m.
+        target: [S, N, 3] m.
+        weight: [S, N].
+    """
     weight = (weight / weight.sum(-1, keepdim=True)).unsqueeze(-1)
     a, b = (weight * source).sum(-2, keepdim=True), (weight * target).sum(-2, keepdim=True)
     U, _, Vh = torch.linalg.svd((weight * (target - b)).mT @ (source - a))

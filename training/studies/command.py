@@ -29,6 +29,7 @@ STUDY_NAMES: tuple[str, ...] = (
     "fault_injection",
     "honesty",
     "air",
+    "camera",
     "rgbench",
 )
 
