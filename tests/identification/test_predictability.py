@@ -53,7 +53,7 @@ def test_the_beginning_that_held_is_fitted_at_once(objective, monkeypatch):
     growth[20:] = 10.0
     monkeypatch.setattr(predictability, "_solve_part", solver(asked, longest=1.0))
     fit = predictability.fit_predictable_part(objective, failed_check(growth), torch.tensor(0.0), lambda *_: False)
-    assert asked == [(0.5, 0.1)]
+    assert asked == [(0.5, predictability.PREDICTABILITY_SETTINGS.final_tolerance)]
     assert "20 of 40, were used" in fit.checked.warnings[0]
 
 

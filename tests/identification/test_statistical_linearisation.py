@@ -243,7 +243,7 @@ def test_the_beginning_grows_until_derivatives_fail(monkeypatch):
     shares, starts, tolerances = zip(*asked, strict=True)
     assert shares == pytest.approx([0.1, 0.15, 0.22, 0.33, 0.5, 0.415, 0.4575, 0.415])
     assert starts == pytest.approx([0.0, 0.0, 0.15, 0.22, 0.33, 0.33, 0.415, 0.415])
-    assert tolerances == (*[1.0] * 7, 0.1)
+    assert tolerances == (*[1.0] * 7, predictability.PREDICTABILITY_SETTINGS.final_tolerance)
     assert "42 of 100, were used" in result.checked.warnings[0]
 
 

@@ -170,10 +170,10 @@ def identify(
         options = [method, stop, rate, starts]
         objective.journal = ResumableStore(journal, [*options, *objective.fingerprint_parts(), start], resume)
 
-    search = Search(objective, stop, on_progress, assign_strata(recordings))
+    noise_std = estimate_point_noise(recordings)
+    search = Search(objective, stop, on_progress, assign_strata(recordings), noise_std)
     before = objective.observe(objective.start)
     outcome = search.run(method, start, iterations, rate, not warm_start and stop != "paper", starts)
-    noise_std = estimate_point_noise(recordings)
     fit = _assemble_result(search, before, outcome, began, profile, fine_scene, model_errors, noise_std)
     model = describe_model(cloth, fit, originals, recordings, dt)
     return replace(fit, model=model, recordings=list(recordings), warnings=[*notes, *fit.warnings])

@@ -40,7 +40,7 @@ class PredictabilitySettings:
     max_bisections: int = 2
     max_iterations: int = 20
     growing_tolerance: float = 1.0
-    final_tolerance: float = 0.1
+    final_tolerance: float = 0.3
     max_relative_error: float = 0.25
 
 

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from typing import Any, Literal, NamedTuple
 
 from torch import Tensor
 
 from ...errors import SimulationDiverged, UnstableStep
-from ..uncertainty.consider_covariance import solution_covariance
+from ..uncertainty.consider_covariance import points_misfit, solution_covariance
 from ..uncertainty.estimates import make_estimates
+from ..uncertainty.misfit import find_misfit
 from . import levenberg_marquardt, linearity, multistart, predictability, statistical_linearisation
 from .convergence import find_failure_reason
 from .gradient_descent import chamfer_to_nearest_vertex, minimise_by_gradient_descent, minimise_by_lbfgs
@@ -26,6 +28,7 @@ NEAR_OPTIMUM_NOTE = (
     "its end is near enough to the optimum to count: the slopes there lead at most one standard error farther, and the "
     "standard errors include that step"
 )
+MIN_APPROACH_RATIO = 0.8  # of the misfit that a round of simulations leaves, to that before, for another round
 HOPED_STD_RATIO = 2.0  # by which standard errors may yet fall in more rounds of simulations around a solution
 SAMPLED_FIT_NOTE = "simulations around the solution know what is near, not what is best"
 UNFINISHED_REMEDY = (
@@ -59,6 +62,7 @@ class Search:
         stop: "converged" or "paper".
         on_progress: called after every iteration.
         strata: [E] groups of replicates (``replicates.assign_strata``).
+        noise_std: of the points [m], against which their misfit counts.
 
     Attributes:
         history: one entry per iteration.
@@ -67,9 +71,15 @@ class Search:
     """
 
     def __init__(
-        self, objective: Objective, stop: str, on_progress: Progress | None, strata: Tensor | None = None
+        self,
+        objective: Objective,
+        stop: str,
+        on_progress: Progress | None,
+        strata: Tensor | None = None,
+        noise_std: float = math.inf,
     ) -> None:
-        self.objective, self.stop, self.on_progress, self.strata = objective, stop, on_progress, strata
+        self.objective, self.stop, self.on_progress = objective, stop, on_progress
+        self.strata, self.noise_std, self._least_misfit = strata, noise_std, math.inf
         self.history: list[dict[str, Any]] = []
         self.partial_simulations = 0
         self.reached_paper_threshold = False
@@ -128,6 +138,7 @@ class Search:
         def on_round(raw: Tensor) -> bool:
             return self.append_history(raw, full)
 
+        self._least_misfit = points_misfit(full, failed.final) or 0.0
         sampled = statistical_linearisation.fit_by_sampling(
             full, failed, beginning, iterations, on_round, self.strata, self._could_identify
         )
@@ -135,10 +146,17 @@ class Search:
             return (full, failed) if beginning is None else (beginning.objective, beginning.checked)
         return full, sampled
 
-    def _could_identify(self, raw: Tensor, covariance: Tensor) -> bool:
-        """Whether with smaller standard errors any parameter would be identified that was not measured."""
+    def _could_identify(self, at: levenberg_marquardt.Iterate, covariance: Tensor) -> bool:
+        """Whether with smaller standard errors any parameter would be identified that was not measured.
+
+        None would, if the model does not describe the data and the search comes no nearer to them.
+        """
         unknowns, hoped = self.objective.unknowns, covariance / HOPED_STD_RATIO**2
-        estimates = make_estimates(self.objective.cloth, unknowns, raw, hoped).parameters
+        misfit, before = points_misfit(self.objective, at) or 0.0, self._least_misfit
+        self._least_misfit = min(misfit, before)
+        if find_misfit(misfit, self.noise_std) and not misfit < MIN_APPROACH_RATIO * before:
+            return False
+        estimates = make_estimates(self.objective.cloth, unknowns, at.raw, hoped).parameters
         return any(estimates[u.name].identifiable for u in unknowns if not u.measured)
 
     def _undecided_parameters(self, objective: Objective, checked: linearity.LinearityCheck) -> list[str]:

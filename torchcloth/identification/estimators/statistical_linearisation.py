@@ -127,7 +127,7 @@ def fit_by_sampling(
     rounds: int,
     on_round: Callable[[Tensor], object],
     strata: Tensor | None = None,
-    could_identify: Callable[[Tensor, Tensor], bool] = lambda raw, covariance: True,
+    could_identify: Callable[[Iterate, Tensor], bool] = lambda at, covariance: True,
 ) -> LinearityCheck | None:
     """Fit all frames by simulations spread around the solution.
 
@@ -138,8 +138,8 @@ def fit_by_sampling(
         rounds: largest number of rounds.
         on_round: called with every point that the search comes to.
         strata: [E] groups of replicates, as in ``solution_covariance``.
-        could_identify: whether a search that is at some unknowns [K] with a covariance [K, K] may yet identify
-            something; else it ends, because simulations are dear.
+        could_identify: whether a search that is at some point with a covariance [K, K] may yet identify something;
+            else it ends, because simulations are dear.
 
     Returns:
         The solution, or None where too many simulations fail.
@@ -198,7 +198,7 @@ def _search(
     start: Tensor,
     rounds: int,
     on_round: Callable[[Tensor], object],
-    could_identify: Callable[[Tensor, Tensor], bool],
+    could_identify: Callable[[Iterate, Tensor], bool],
 ) -> SampledFit:
     """Gauss-Newton on slopes by regression, from ``start`` [K].
 
@@ -230,12 +230,12 @@ def _search(
         is_small_move = bool(((moved - raw).abs() <= s.converged_std_errors * deviation)[:fabric].all())
         converged = is_small_move and not knows_less  # errors that grew would make any move small
         on_round(moved)
-        is_stalled = stalled_rounds == s.max_stalled_rounds or not could_identify(moved, covariance)
+        linear = at.linear._replace(residual=at.linear.residual + at.linear.jacobian @ (moved - raw))
+        there = levenberg_marquardt.evaluate_point(problem, moved, linear)._replace(converged=converged)
+        is_stalled = stalled_rounds == s.max_stalled_rounds or not could_identify(there, covariance)
         if converged or is_stalled or not rounds_left:
-            linear = at.linear._replace(residual=at.linear.residual + at.linear.jacobian @ (moved - raw))
-            final = levenberg_marquardt.evaluate_point(problem, moved, linear)._replace(converged=converged)
             simulations = len(cloud.samples) * len(objective.episodes)
-            return SampledFit(final, _influence(objective, samples, raw), covariance, simulations)
+            return SampledFit(there, _influence(objective, samples, raw), covariance, simulations)
         raw, spread = moved, torch.minimum(torch.maximum(deviation, narrowest), widest)
 
 

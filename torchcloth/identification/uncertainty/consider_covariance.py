@@ -65,6 +65,14 @@ def shared_misfit(objective: Objective, at: levenberg_marquardt.Iterate) -> Tens
     return torch.where(stated > 0, torch.minimum(split.shared, excess), split.shared)
 
 
+def points_misfit(objective: Objective, at: levenberg_marquardt.Iterate) -> float | None:
+    """Compute the root mean square misfit [m] that points of a part of the fabric share; None without points."""
+    for index, block in enumerate(objective.blocks[: len(at.scale)]):
+        if block.name == "points":
+            return float(shared_misfit(objective, at)[index].sqrt())
+    return None
+
+
 def add_initial_shape_noise(
     objective: Objective, final: levenberg_marquardt.Iterate, covariance: Tensor, by_tangents: bool = True
 ) -> Tensor:

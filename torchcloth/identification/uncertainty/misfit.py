@@ -122,7 +122,7 @@ def estimate_point_noise(recordings: Sequence[Recording]) -> float:
 
 
 def find_misfit(
-    misfit: float, noise: float, chamfer_over_start: float, criteria: MisfitCriteria = MISFIT_CRITERIA
+    misfit: float, noise: float, chamfer_over_start: float = 0.0, criteria: MisfitCriteria = MISFIT_CRITERIA
 ) -> str:
     """Return why a fit describes its data too badly to say anything; empty where it does not.
 
