@@ -23,7 +23,7 @@ def add_network_option(parser: argparse.ArgumentParser) -> None:
         const=SHIPPED,
         metavar="FILE",
         help="take the first shape from the first clouds by a network: the shipped one, or the weights in FILE of "
-        "python -m torchcloth.training.pose (default: the first shape that the episode has)",
+        "python -m torchcloth.training.pose; stands after EPISODE (default: the first shape that the episode has)",
     )
 
 

@@ -373,7 +373,8 @@ def _check_gripper_distance(name: str, places: Mapping[str, tuple[Tensor, Tensor
                 f"{name}: grasp {key!r}",
                 got=f"the held patch {distance:.2f} m from its gripper at the first frame",
                 expected=f"within {MAX_PATCH_TO_GRIPPER_M:g} m",
-                remedy="give cloth.initial_vertices in world coordinates, or check the gripper's path and frame",
+                remedy="give cloth.initial_vertices in world coordinates (--network estimates them), or check "
+                "the gripper's path and frame",
             )
 
 

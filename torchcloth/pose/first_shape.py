@@ -258,10 +258,12 @@ def estimate_first_shape(
             f"{episode.name}: first shape by the network",
             got=f"an edge strained by {strain:.2g} between what the cloud shows and what the grippers hold",
             expected=f"at most {MAX_EDGE_STRAIN:g}",
-            remedy="check that the gripper's frame lies where it holds the cloth; else give cloth.initial_vertices",
+            remedy="check that the gripper's frame lies where it holds the cloth, and the size of the cloth; "
+            "else give cloth.initial_vertices",
         )
     rival = _rival_distance(hypotheses, distances, best)
-    return FirstShape(cloth.mesh, hypotheses[best], std[best], velocities[best], distances, weights, rival)
+    x, v = hypotheses[best].to(episode.initial), velocities[best].to(episode.initial)
+    return FirstShape(cloth.mesh, x, std[best], v, distances, weights, rival)
 
 
 def _rival_distance(hypotheses: Tensor, distances: Tensor, best: int) -> float:
