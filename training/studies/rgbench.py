@@ -30,7 +30,7 @@ from .rgbench_data import (
 from .rgbench_simulation import RgbenchSettings, fit_capture, simulate_capture
 
 CAPTURES_PER_CELL, FAST_CAPTURES_PER_CELL = 3, 1
-FIT_ITERATIONS, FAST_FIT_ITERATIONS = 10, 1
+RGBENCH_FIT_ITERATIONS, FAST_FIT_ITERATIONS = 10, 1
 DISTANCE_NAMES = ("vertices_l1", "surface")
 
 
@@ -56,7 +56,7 @@ def run(options: argparse.Namespace) -> None:
         raise InvalidInput("--captures", got=count, expected="1 or more")
     configs = options.data / "configs" if options.configs is None else options.configs
     captures = select_captures(list_captures(options.data, configs), options.garments, options.actions, count)
-    settings = RgbenchSettings(FAST_FIT_ITERATIONS if options.fast else FIT_ITERATIONS, options.fast)
+    settings = RgbenchSettings(FAST_FIT_ITERATIONS if options.fast else RGBENCH_FIT_ITERATIONS, options.fast)
     places = {"data": str(options.data.resolve()), "configs": str(configs.resolve())}
     study = ResumableStudy(options.out, {"study": "rgbench", **places, "fast": options.fast})
     fits = _fit_fabrics(study, captures, options, configs, settings) if options.fit else {}
