@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import io
 from pathlib import Path
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple, cast
 
 import numpy as np
 from torch import Tensor
 
 from torchcloth.errors import InvalidInput, MissingDependency
 from torchcloth.recordings.robot_files import PACKAGE_PREFIXES, locate_mesh_file
+
+if TYPE_CHECKING:
+    import trimesh
 
 Array = np.ndarray
 MESH_READERS = (".stl", ".obj", ".ply")  # endings of the files that are read
@@ -70,7 +73,8 @@ def read_link_mesh(name: str, folder: Path, scale: tuple[float, float, float]) -
         raise InvalidInput(f"mesh {path}", got=got, expected=expected, remedy="simplify it")
     try:  # from memory, without materials: the file cannot name others
         content = io.BytesIO(path.read_bytes())
-        mesh = trimesh.load(content, file_type=suffix[1:], force="mesh", skip_materials=True)
+        read = trimesh.load(content, file_type=suffix[1:], force="mesh", skip_materials=True)
+        mesh = cast("trimesh.Trimesh", read)
         vertices, faces = np.asarray(mesh.vertices, float) * scale, np.asarray(mesh.faces, np.int64)
     except Exception as error:  # trimesh raises bare exceptions
         raise InvalidInput(f"mesh {path} cannot be read", got=error, remedy="export it again") from error

@@ -50,7 +50,11 @@ def build_solid_meshes(solids: Iterable[Solid], at: int | None = None) -> list[t
         pose = solid.pose.detach().cpu().numpy() if hasattr(solid.pose, "detach") else np.asarray(solid.pose)
         pose = pose if at is None else pose[at]
         mesh = getattr(solid, "mesh", None)
-        placed.append(build_solid_mesh(solid.kind, solid.size, pose) if mesh is None else _place(*mesh, pose))
+        if mesh is None:
+            placed.append(build_solid_mesh(solid.kind, solid.size, pose))
+        else:
+            vertices, faces = mesh
+            placed.append(_place(vertices, faces, pose))
     if not placed:
         warnings.warn(
             "no solid: an arm without solids hides nothing, and where a camera sees it, it is taken for cloth; add "

@@ -13,11 +13,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from torchcloth import observe, robots
+from torchcloth import observe
 from torchcloth._utils.constants import Z_95
 from torchcloth.errors import TorchclothError
 from torchcloth.inspection.camera_from_arm import JOINT_OFFSET_STD_RAD, ArmFunction, make_arm_function
 from torchcloth.meshes import rectangle
+from torchcloth.robots import Table, load  # pyright: ignore[reportMissingImports] - mapped from robots/
 
 from ..resumable import ResumableStudy, check_jobs, write_result
 from .manipulations.console_tables import heading_table, number, show
@@ -108,7 +109,7 @@ def make_view(
         shrink: of the images, along each side.
     """
     rng = np.random.default_rng(seed)
-    arm = robots.load("rizon4", frame="tcp_closed")
+    arm = load("rizon4", frame="tcp_closed")
     size, phase, rate = rng.uniform(0.2, 0.5, 7), rng.uniform(0, 2 * np.pi, 7), rng.uniform(0.15, 0.4, 7)
     t = np.arange(-0.5, ARM_MOTION_S + 0.5, 0.01)
     q = arm.home.numpy() + amplitude * size * np.sin(2 * np.pi * rate * t[:, None] + phase)
@@ -150,7 +151,7 @@ def _place_camera(
 def _room() -> list[tuple[Array, Array]]:
     wall, floor = np.eye(4), np.eye(4)
     wall[0, 3], floor[2, 3] = -0.6, -0.8
-    table = observe.build_solid_meshes([robots.Table().primitive()])
+    table = observe.build_solid_meshes([Table().primitive()])
     walls = [("box", (0.02, 6.0, 4.0), wall), ("box", (6.0, 6.0, 0.02), floor)]
     return [*table, *(observe.build_solid_mesh(*body) for body in walls)]
 
@@ -158,6 +159,7 @@ def _room() -> list[tuple[Array, Array]]:
 def _cloth(rng: np.random.Generator, tip: Array) -> tuple[Array, Array]:
     """A wavy cloth that hangs from the gripper by the middle of its upper edge, turned at random."""
     mesh = rectangle(CLOTH_SIZE_M, CLOTH_SIZE_M, triangles=250)
+    assert mesh.uv is not None
     turn, (u, v) = rng.uniform(0, 2 * np.pi), mesh.uv.T
     along, across = np.array([np.cos(turn), np.sin(turn), 0.0]), np.array([-np.sin(turn), np.cos(turn), 0.0])
     wave = 0.03 * np.sin(20 * u + turn)
