@@ -19,6 +19,7 @@ Mesh = tuple[Array, Array]
 MIN_TABLE_LEVEL_COSINE = np.cos(np.deg2rad(10.0))  # a table is level to 10 degrees
 MAX_TABLE_CANDIDATES = 4  # planes that are tried
 RANSAC_DRAWS = 300  # of three points, for each plane
+ALL_DRAWS = 1.0  # probability that ends the draws: with less, the threads' timing decides where they end
 PLANE_REFITS = 20  # least-squares fits after the draws
 MIN_PLANE_POINTS = 100
 MIN_PLANE_FRACTION = 0.02  # of the points; a plane of fewer is no table
@@ -317,7 +318,7 @@ def _find_table(points: Array, stages: Segmentation) -> Array | None:
     for _ in range(MAX_TABLE_CANDIDATES):
         if len(remaining) < max(MIN_PLANE_POINTS, MIN_PLANE_FRACTION * len(points)):
             return None
-        plane, inliers = _to_open3d(remaining).segment_plane(stages.plane_tolerance, 3, RANSAC_DRAWS)
+        plane, inliers = _to_open3d(remaining).segment_plane(stages.plane_tolerance, 3, RANSAC_DRAWS, ALL_DRAWS)
         plane = _refine_plane(np.asarray(plane), remaining, 2 * stages.plane_tolerance)
         height = points @ plane[:3] + plane[3]
         scatter = _estimate_scatter(height, stages.plane_tolerance) if plane[2] > MIN_TABLE_LEVEL_COSINE else None
