@@ -12,7 +12,7 @@ import sys
 import time
 import zipfile
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from functools import partial
 from itertools import pairwise
@@ -36,6 +36,8 @@ from .scenes import (
     SPLIT_CODES,
     SPLITS,
     RejectedScene,
+    Scene,
+    SimulatedScene,
     Split,
     build_scene,
     simulate,
@@ -49,10 +51,15 @@ MOTION_KNOT_PERIOD_S = POSE_FRAME_PERIOD_S / 2
 DATA_PROGRESS_PERIOD_S = 10.0
 
 
-def make_motion(seed: int, split: Split) -> dict[str, Array]:
+def make_motion(seed: int, split: Split, simulate: Callable[[Scene], SimulatedScene] = simulate) -> dict[str, Array]:
     """Simulate and observe the motion of a seed; return the arrays of its file.
 
     A scene that was rejected has no frames, and ``rejected`` says why.
+
+    Args:
+        seed: of the scene.
+        split: "train" or "held-out".
+        simulate: the engine; it may raise `RejectedScene`.
     """
     head = {"schema": np.array(DATA_SCHEMA), "seed": np.array(seed), "split": np.array(split)}
     scene = build_scene(seed, split)

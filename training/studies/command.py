@@ -20,6 +20,7 @@ STUDY_NAMES: tuple[str, ...] = (
     "classify",
     "measured",
     "pose",
+    "pose_garments",
     "pose_network",
     "cost",
     "reach",
