@@ -31,7 +31,7 @@ from .manipulations.console_tables import heading_table, show
 SCENE_COUNT, FAST_SCENE_COUNT = 24, 1
 FAST_DURATION_S = 0.4
 RAYLEIGH_DAMPING_S = 1e-3  # MuJoCo's flex has no damping of bending alone
-STEP_FRACTION = 0.5  # of MuJoCo's stable step: violent motions stretch the cloth
+MUJOCO_STEP_FRACTION = 0.5  # of MuJoCo's stable step: violent motions stretch the cloth
 SPLIT = "held-out"
 
 
@@ -89,7 +89,7 @@ def simulate_by_mujoco(fast: bool, scene: Scene) -> SimulatedScene:
     }
     duration = FAST_DURATION_S if fast else scene.duration
     times = POSE_FRAME_PERIOD_S * np.arange(int(duration / POSE_FRAME_PERIOD_S + 1e-6) + 1)
-    garment = MujocoGarment(spec, STEP_FRACTION)
+    garment = MujocoGarment(spec, MUJOCO_STEP_FRACTION)
     try:
         still = garment.run(
             scene.start, np.array([0.0, SETTLING_S]), hold_grips(grips), damping_rate=SETTLING_DAMPING_PER_S
