@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
@@ -11,13 +10,19 @@ import numpy as np
 
 from ...errors import RecordingError
 from .. import checks
-from .imported import MAX_SHOWN_CHARACTERS, read_bytes, to_seconds
+from .file_times import (
+    MAX_FILE_INTERVAL_S,
+    are_frame_numbers,
+    assign_times,
+    find_file_column,
+    find_last_number,
+    order_by_time,
+)
+from .imported import read_bytes, to_seconds
 from .pcd_file import parse_pcd
 from .tables import Table, TimeUnit, find_time_columns, read_stamps, to_stamps
 
 CLOUD_FILE_SUFFIX = ".pcd"
-MAX_CLOUD_INTERVAL_S = 2.0  # between two clouds of a moving cloth
-_LAST_NUMBER_PATTERN = re.compile(r"(\d+(?:\.\d+)?)\D*$")
 
 
 class CloudTimes(NamedTuple):
@@ -56,45 +61,26 @@ def read_cloud_times(folder: Path, table: Table | None, unit: TimeUnit | None) -
         ns, notes = _read_names(folder, paths, unit)
     else:
         ns, notes = _read_table(table, paths, unit)
-    order = np.argsort(ns, kind="stable")
-    repeated = np.flatnonzero(np.diff(ns[order]) == 0)
-    if len(repeated):
-        first, second = (paths[order[k]].name for k in (repeated[0], repeated[0] + 1))
-        raise RecordingError(f"{folder}: two clouds have one time", got=f"{first} and {second}", remedy="remove one")
+    order = order_by_time(folder, paths, ns, "cloud")
     return CloudTimes([paths[k] for k in order], ns[order], notes)
 
 
 def _read_names(folder: Path, paths: Sequence[Path], unit: TimeUnit | None) -> tuple[np.ndarray, tuple[str, ...]]:
-    numbers = [_LAST_NUMBER_PATTERN.search(path.stem) for path in paths]
-    texts = [number.group(1) for number in numbers if number]
-    is_counted = len(texts) > 1 and float(np.median(np.diff(sorted(map(float, texts))))) == 1.0
-    if len(texts) < len(paths) or is_counted:
+    texts = [number for number in map(find_last_number, paths) if number is not None]
+    if len(texts) < len(paths) or are_frame_numbers(texts):
         got = f"names such as {paths[0].name}"
         expected = "a CSV table with a time for each file, or times in the names"
         raise RecordingError(f"{folder} gives no times of its clouds", got=got, expected=expected)
-    stamps = to_stamps(texts, f"{folder}: names of the clouds", MAX_CLOUD_INTERVAL_S, unit)
+    stamps = to_stamps(texts, f"{folder}: names of the clouds", MAX_FILE_INTERVAL_S, unit)
     return stamps.ns, stamps.notes
 
 
 def _read_table(table: Table, paths: Sequence[Path], unit: TimeUnit | None) -> tuple[np.ndarray, tuple[str, ...]]:
-    cells = range(len(table.rows[0]))
-    names = next((k for k in cells if table.rows[0][k].lower().endswith(CLOUD_FILE_SUFFIX)), None)
-    columns = find_time_columns(table)
-    if columns[0] == names:
-        columns = next((k for k in cells if k != names), columns[0]), None
-    stamps = read_stamps(table, columns, MAX_CLOUD_INTERVAL_S, unit)
-    notes = (*table.notes, *stamps.notes)
-    if names is None:
-        if len(table.rows) != len(paths):
-            got = f"{len(table.rows)} times of {len(paths)} clouds"
-            raise RecordingError(f"{table.path} does not fit the clouds", got=got, expected="a time for each cloud")
-        return stamps.ns, notes
-    by_name = dict(zip((Path(cell).name for cell in table.column(names)), stamps.ns.tolist(), strict=True))
-    missing = next((path.name for path in paths if path.name not in by_name), None)
-    if missing is not None:
-        got = f"no time of {missing[:MAX_SHOWN_CHARACTERS]}"
-        raise RecordingError(f"{table.path} does not fit the clouds", got=got, remedy="add it, or remove the file")
-    return np.array([by_name[path.name] for path in paths], dtype=np.int64), notes
+    files, columns = find_file_column(table, CLOUD_FILE_SUFFIX), find_time_columns(table)
+    if columns[0] == files:
+        columns = next((k for k in range(len(table.rows[0])) if k != files), columns[0]), None
+    stamps = read_stamps(table, columns, MAX_FILE_INTERVAL_S, unit)
+    return assign_times(table, files, stamps.ns, paths, "cloud"), (*table.notes, *stamps.notes)
 
 
 def read_clouds(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from pathlib import Path
 from typing import NamedTuple
 
@@ -10,13 +9,19 @@ import numpy as np
 
 from ...errors import RecordingError
 from ..files import is_present
+from .file_times import (
+    MAX_FILE_INTERVAL_S,
+    are_frame_numbers,
+    assign_times,
+    find_file_column,
+    find_last_number,
+    order_by_time,
+)
 from .imported import NANOSECONDS_PER_SECOND
 from .tables import STAMP_WORDS, Table, TimeUnit, find_time_columns, read_stamps, read_table, split_words, to_stamps
 
-MAX_IMAGE_INTERVAL_S = 2.0  # between two depth images of a moving cloth
 MIN_DEPTH_IMAGES = 4
 TIME_FILE_NAMES = ("timestamps", "depth_times", "depth_timestamps", "times", "stamps", "depth")  # .csv or .txt
-_LAST_NUMBER_PATTERN = re.compile(r"(\d+(?:\.\d+)?)\D*$")
 
 
 class DepthFolder(NamedTuple):
@@ -54,7 +59,7 @@ def read_depth_folder(
     if len(paths) < MIN_DEPTH_IMAGES:
         got = f"{len(paths)} PNG files"
         raise RecordingError(f"{folder} holds no depth images", got=got, expected="16-bit PNG files, 0 where invalid")
-    numbers = [_last_number(path) for path in paths]
+    numbers = [find_last_number(path) for path in paths]
     table = times if times is not None else _find_time_file(folder)
     if fps is not None:
         frames = np.array([-1.0 if number is None else float(number) for number in numbers])
@@ -65,13 +70,8 @@ def read_depth_folder(
         ns, notes = _read_times(read_table(table), paths, time_unit)
     else:
         ns, notes = _times_in_names(folder, paths, numbers, time_unit)
-    order = np.argsort(ns, kind="stable")
-    ns = ns[order]
-    if (np.diff(ns) == 0).any():
-        k = int(np.argmax(np.diff(ns) == 0))
-        got = f"one time of {paths[order[k]].name} and {paths[order[k + 1]].name}"
-        raise RecordingError(f"{folder}: two images have one time", got=got, remedy="remove one of them")
-    return DepthFolder(tuple(paths[k] for k in order), ns, tuple(notes))
+    order = order_by_time(folder, paths, ns, "image")
+    return DepthFolder(tuple(paths[k] for k in order), ns[order], tuple(notes))
 
 
 def _find_time_file(folder: Path) -> Path | None:
@@ -87,20 +87,11 @@ def _find_time_file(folder: Path) -> Path | None:
 
 def _read_times(table: Table, paths: list[Path], unit: TimeUnit | None) -> tuple[np.ndarray, list[str]]:
     """Times [N] ns of the images from a table that names them, numbers them, or lists a time for each in order."""
-    files = next((k for k in range(len(table.rows[0])) if table.rows[0][k].lower().endswith(".png")), None)
+    files = find_file_column(table, ".png")
     column = _time_column(table, files)
-    stamps = read_stamps(table, column, MAX_IMAGE_INTERVAL_S, unit)
+    stamps = read_stamps(table, column, MAX_FILE_INTERVAL_S, unit)
     notes = [f"times of the images: {table.path.name}, {table.name_column(column[0])}", *table.notes, *stamps.notes]
-    if files is None:
-        if len(table.rows) != len(paths):
-            got = f"{len(table.rows)} times of {len(paths)} images"
-            raise RecordingError(f"{table.path} does not fit the images", got=got, expected="a time for each image")
-        return stamps.ns, notes
-    by_name = dict(zip((Path(cell).name for cell in table.column(files)), stamps.ns.tolist(), strict=True))
-    missing = next((path.name for path in paths if path.name not in by_name), None)
-    if missing is not None:
-        raise RecordingError(f"{table.path} does not fit the images", got=f"no time of {missing}", remedy="add it")
-    return np.array([by_name[path.name] for path in paths]), notes
+    return assign_times(table, files, stamps.ns, paths, "image"), notes
 
 
 def _time_column(table: Table, files: int | None) -> tuple[int, int | None]:
@@ -127,15 +118,10 @@ def _times_in_names(
 ) -> tuple[np.ndarray, list[str]]:
     missing = next((path.name for path, number in zip(paths, numbers, strict=True) if number is None), None)
     texts = [number or "" for number in numbers]
-    if missing is not None or float(np.median(np.diff(sorted(map(float, texts))))) == 1.0:
+    if missing is not None or are_frame_numbers(texts):
         got = f"frame numbers such as {paths[0].name}" if missing is None else missing
         expected = f"times in the names, or in {TIME_FILE_NAMES[0]}.csv in the folder or beside it"
         remedy = "name a table of times (--depth-times FILE), or state --fps"
         raise RecordingError(f"{folder} gives no times of its images", got=got, expected=expected, remedy=remedy)
-    stamps = to_stamps(texts, f"{folder.name}: names of the images", MAX_IMAGE_INTERVAL_S, unit)
+    stamps = to_stamps(texts, f"{folder.name}: names of the images", MAX_FILE_INTERVAL_S, unit)
     return stamps.ns, [f"times of the images: in their names, such as {paths[0].name}", *stamps.notes]
-
-
-def _last_number(path: Path) -> str | None:
-    match = _LAST_NUMBER_PATTERN.search(path.stem)
-    return match.group(1) if match else None
