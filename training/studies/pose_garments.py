@@ -24,8 +24,8 @@ from ..pose.data import PoseDataset, collate
 from ..pose.motions import make_motion, motion_path
 from ..pose.scenes import POSE_FRAME_PERIOD_S, RejectedScene, Scene, SimulatedScene, build_scene
 from ..resumable import ResumableStudy, write_result
-from ..validation.independent.garment import SETTLING_DAMPING_PER_S, SETTLING_S, GarmentSpec, MujocoGarment
-from ..validation.independent.mujoco_cloth import Grip, hold_grips
+from ..validation.independent.garment import GarmentSpec, simulate_garment
+from ..validation.independent.mujoco_cloth import Grip
 from .manipulations.console_tables import heading_table, show
 
 SCENE_COUNT, FAST_SCENE_COUNT = 24, 1
@@ -89,12 +89,8 @@ def simulate_by_mujoco(fast: bool, scene: Scene) -> SimulatedScene:
     }
     duration = FAST_DURATION_S if fast else scene.duration
     times = POSE_FRAME_PERIOD_S * np.arange(int(duration / POSE_FRAME_PERIOD_S + 1e-6) + 1)
-    garment = MujocoGarment(spec, MUJOCO_STEP_FRACTION)
     try:
-        still = garment.run(
-            scene.start, np.array([0.0, SETTLING_S]), hold_grips(grips), damping_rate=SETTLING_DAMPING_PER_S
-        )
-        moved = garment.run(still.x[-1], times, grips)
+        moved = simulate_garment(spec, scene.start, times, grips, MUJOCO_STEP_FRACTION)
     except SimulationDiverged as error:
         raise RejectedScene(f"scene {scene.seed} of {scene.split}", got=str(error)) from error
     return SimulatedScene(scene, times, moved.x, moved.x, moved.v)
@@ -111,7 +107,8 @@ def run_scene(folder: Path, seed: int, fast: bool) -> dict[str, Any]:
     with write_atomically(motion_path(folder, seed)) as part:
         np.savez(part, **motion)  # pyright: ignore[reportArgumentType] - numpy's stub takes it for a flag
     dataset = PoseDataset(folder)
-    batch = collate([dataset[k] for k in range(len(dataset))])
+    samples = [dataset[k] for k in range(len(dataset))]
+    batch = collate(samples)
     with torch.no_grad():
         answer = load_network()(batch.inputs)
     squared = (answer.x - batch.x).square()
@@ -120,7 +117,7 @@ def run_scene(folder: Path, seed: int, fast: bool) -> dict[str, Any]:
     return facts | {
         "rms": squared.sum(-1).mean(1).sqrt().tolist(),
         "coverage": float(inside[free].double().mean()),
-        "visible": [sample.visible for sample in map(dataset.__getitem__, range(len(dataset)))],
+        "visible": [sample.visible for sample in samples],
     }
 
 

@@ -8,11 +8,9 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from torchcloth._utils.constants import STANDARD_AIR_DENSITY_KG_PER_M3, STANDARD_GRAVITY_M_PER_S2
-from torchcloth.errors import InvalidInput
 
-from . import mujoco_cloth
-from .flex_sheet import STEP_SAFETY_FACTOR, StillAir, flex_xml
-from .mujoco_cloth import Grip, MujocoCloth, hold_grips
+from .flex_sheet import STEP_SAFETY_FACTOR, StillAir
+from .mujoco_cloth import Grip, MujocoCloth, Result, hold_grips, mujoco_version
 
 Array = np.ndarray
 SETTLING_S, SETTLING_DAMPING_PER_S = 1.2, 12.0
@@ -84,28 +82,10 @@ class MujocoGarment(MujocoCloth):
     """
 
     def __init__(self, spec: GarmentSpec, step_fraction: float = 1.0) -> None:
-        mujoco_cloth.mujoco_version()
-        mujoco = mujoco_cloth.mujoco
+        mujoco_version()
         self.spec, self.dt = spec, step_fraction * spec.max_stable_step  # pyright: ignore[reportAttributeAccessIssue] - gravity is read
         self.faces, self.mass = spec.faces, spec.masses
-        self.model = mujoco.MjModel.from_xml_string(
-            flex_xml(
-                spec.rest,
-                spec.faces,
-                self.dt,
-                membrane_stiffness=spec.membrane_stiffness,
-                poisson_ratio=spec.poisson_ratio,
-                bending_stiffness=spec.bending_stiffness,
-                damping_time=spec.damping_time,
-                gravity=spec.gravity,
-            )
-        )
-        if self.model.nv != 3 * len(spec.rest):
-            raise InvalidInput("the flex's degrees of freedom", got=self.model.nv, expected=str(3 * len(spec.rest)))
-        self.model.body_mass[1:] = self.mass
-        self.data = mujoco.MjData(self.model)
-        mujoco.mj_setConst(self.model, self.data)
-        self._rest = spec.rest
+        self._load_flex(spec.rest)
         self.force_terms, self.has_implicit_damping = [], True
         has_drag = spec.drag_normal > 0
         self._air = StillAir(spec, spec.faces, len(spec.rest)) if has_drag else None  # pyright: ignore[reportArgumentType]
@@ -113,8 +93,8 @@ class MujocoGarment(MujocoCloth):
 
 def simulate_garment(
     spec: GarmentSpec, x0: Array, times: Array, grips: Mapping[str, Grip], step_fraction: float = 1.0
-) -> Array:
-    """Let the garment hang still in its grippers from x0 [V, 3] m, move it, and return its final shape [V, 3] m.
+) -> Result:
+    """Let the garment hang still in its grippers from x0 [V, 3] m, then move it; return its state at the times [T] s.
 
     Raises:
         SimulationDiverged: the simulation is unstable; take a smaller fraction of the step.
@@ -123,4 +103,4 @@ def simulate_garment(
     settling = np.array([0.0, SETTLING_S])
     x = garment.run(x0, settling, hold_grips(grips), damping_rate=SETTLING_DAMPING_PER_S).x[-1]
     begin = {name: replace(grip, t=grip.t - times[0]) for name, grip in grips.items()}
-    return garment.run(x, np.array([0.0, times[-1] - times[0]]), begin).x[-1]
+    return garment.run(x, times - times[0], begin)

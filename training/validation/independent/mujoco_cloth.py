@@ -183,29 +183,31 @@ class MujocoCloth:
         self.dt = float(dt if dt is not None else max_stable_step(spec))
         self.uv, self.faces = sheet_mesh(spec)
         self.mass = vertex_masses(spec)
-        rest = np.pad(rest_positions(spec), ((0, 0), (0, 1)))  # flat in the plane z = 0
-        self.model = mujoco.MjModel.from_xml_string(
-            flex_xml(
-                rest,
-                self.faces,
-                self.dt,
-                membrane_stiffness=spec.membrane_stiffness,
-                poisson_ratio=spec.poisson_ratio,
-                bending_stiffness=spec.bending_stiffness,
-                damping_time=spec.damping_time,
-                gravity=spec.gravity,
-            )
-        )
-        if self.model.nv != 3 * len(self.uv):
-            raise InvalidInput("the flex's degrees of freedom", got=self.model.nv, expected=str(3 * len(self.uv)))
-        self.model.body_mass[1:] = self.mass  # flexcomp gives all points the same mass; the rim must have less
-        self.data = mujoco.MjData(self.model)
-        mujoco.mj_setConst(self.model, self.data)
-        self._rest = np.column_stack([rest_positions(spec), np.zeros(len(self.uv))])
+        self._load_flex(np.pad(rest_positions(spec), ((0, 0), (0, 1))))  # flat in the plane z = 0
         self.force_terms = list(force_terms)
         # implicit damping knows only the vertices' own inertia
         self.has_implicit_damping = not any(term.has_inertia for term in force_terms)
         self._air = StillAir(spec, self.faces, len(self.uv)) if spec.drag_normal > 0 else None
+
+    def _load_flex(self, rest: Array) -> None:
+        """Build MuJoCo's model of the vertices at rest [V, 3] m, with the cloth's own masses."""
+        spec = self.spec
+        xml = flex_xml(
+            rest,
+            self.faces,
+            self.dt,
+            membrane_stiffness=spec.membrane_stiffness,
+            poisson_ratio=spec.poisson_ratio,
+            bending_stiffness=spec.bending_stiffness,
+            damping_time=spec.damping_time,
+            gravity=spec.gravity,
+        )
+        self._rest, self.model = rest, mujoco.MjModel.from_xml_string(xml)
+        if self.model.nv != 3 * len(rest):
+            raise InvalidInput("the flex's degrees of freedom", got=self.model.nv, expected=str(3 * len(rest)))
+        self.model.body_mass[1:] = self.mass  # flexcomp gives all points the same mass; the rim must have less
+        self.data = mujoco.MjData(self.model)
+        mujoco.mj_setConst(self.model, self.data)
 
     def run(
         self,
