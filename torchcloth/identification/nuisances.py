@@ -147,14 +147,18 @@ class RimOffset(AbstractNuisance):
         return frames._replace(rim_offset=frames.rim_offset + values[0])
 
 
-class GraspOffset(AbstractNuisance):
-    """Offset of the held vertices at the first frame; between grippers it is blended."""
-
-    name, unit, std = "grasp", "m", 0.0015
+class AbstractGraspNuisance(AbstractNuisance):
+    """Three numbers for each gripper."""
 
     def number_names(self, cloth: Cloth, episode: Episode) -> list[str]:
         """Return names of three axes for each gripper."""
         return [f"{name}.{a}" for name in _grasped_vertices(cloth) for a in AXIS_NAMES]
+
+
+class GraspOffset(AbstractGraspNuisance):
+    """Offset of the held vertices at the first frame; between grippers it is blended."""
+
+    name, unit, std = "grasp", "m", 0.0015
 
     def initial_shape_modes(self, cloth: Cloth, episode: Episode) -> Tensor:
         """Return fields whose weights fall with the inverse square of the distance at rest; they add up to one."""
@@ -167,14 +171,10 @@ class GraspOffset(AbstractNuisance):
         return torch.einsum("gv,ab->gavb", weight, torch.eye(3).to(weight)).flatten(0, 1)
 
 
-class GraspTurn(AbstractNuisance):
+class GraspTurn(AbstractGraspNuisance):
     """Turn of what each gripper holds about its middle, at the first frame; the fabric nearby turns along."""
 
     name, unit, std = "grasp_turn", "rad", 0.05
-
-    def number_names(self, cloth: Cloth, episode: Episode) -> list[str]:
-        """Return names of three axes for each gripper."""
-        return [f"{name}.{a}" for name in _grasped_vertices(cloth) for a in AXIS_NAMES]
 
     def initial_shape_modes(self, cloth: Cloth, episode: Episode) -> Tensor:
         """Return small turns, which fade with the distance at rest within a quarter of the cloth's extent."""
