@@ -9,13 +9,13 @@ recording is a function of its seed alone.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 import torch
 from scipy.interpolate import CubicSpline
-from scipy.spatial.transform import Rotation, RotationSpline
+from scipy.spatial.transform import Rotation
 
 from torchcloth import observe, recordings
 from torchcloth._utils.constants import STANDARD_AIR_DENSITY_KG_PER_M3
@@ -24,9 +24,10 @@ from torchcloth.robots import Scene as Rig  # pyright: ignore[reportMissingImpor
 from torchcloth.robots import bimanual_rig  # pyright: ignore[reportMissingImports] - mapped from robots/
 
 from .air import AirSpec
+from .camera_room import build_room, make_camera_noise, place_camera, shrink_camera
 from .flex_sheet import SheetSpec, sheet_mesh
 from .motions import KNOT_PERIOD_S, minimum_jerk, rotations_about_z
-from .mujoco_cloth import Grip, MujocoCloth, Result, hold_grips, mujoco_version
+from .mujoco_cloth import Grip, Result, mujoco_version
 from .plate import PlateSpec
 from .rig_recording import (
     AREAL_DENSITY_RANGE,
@@ -39,8 +40,8 @@ from .rig_recording import (
     POISSON_RANGE,
     true_parameters,
 )
-from .scene import HANGING_SETTLING_S, SETTLING_DAMPING_PER_S, GripSpec, Scene, make_force_terms, stable_step
-from .swing_motion import Swing, measure_joint_usage
+from .scene import GripSpec, Scene, settle_and_move
+from .swing_motion import Swing, hold_from_above, measure_joint_usage, move_origin, sample_poses
 
 Array = np.ndarray
 Mesh = tuple[Array, Array]
@@ -63,17 +64,13 @@ START_RANGE_S, DURATION_RANGE_S = (0.5, 0.8), (1.0, 1.5)  # of the recording, in
 CAMERA_RATE_HZ = 30.0
 PARKED_TURN_RAD = 1.0  # of the first joint of an arm that holds nothing
 IK_ATTEMPTS = 20
-DISTANCE_RANGE_M = {"kinect": (1.0, 1.3), "realsense": (0.95, 1.2)}  # of the camera from the cloth
-AZIMUTH_RANGE_RAD, ELEVATION_RANGE_RAD = 0.9, (0.0, 0.35)
+AZIMUTH_RANGE_RAD = 0.9
 BAR_WIDTH_RANGE = (0.15, 0.30)  # over the width of the cloth in the image
 BAR_PLACE_FRACTION, BAR_LENGTH_M, BAR_TILT_STD_RAD = 0.6, 1.5, 0.2  # place: of the way from the cloth to the camera
-WALL_X_M, FLOOR_Z_M = -0.6, -0.75
 MAX_POINTS = 250
 # The rig's margins for the bias of the sensor, which moves the arms' points too.
 ROBOT_MARGIN_M, SEGMENTED_TABLE_MARGIN_M = {"kinect": 0.02, "realsense": 0.03}, 0.02
 WORKSPACE_MARGIN_M = 0.05
-# The scale of a D435 is off by 2 % out of the box. The rig has corrected it on its own arms, to half a per cent.
-CALIBRATED_STEREO_NOISE = replace(observe.StereoNoise.d435(), bias_scale=0.005)
 PIXEL_STRIDE = 2  # every other row and column is segmented: a cloud has thousands of points more than it needs
 ISOLATION_RADIUS_M, ISOLATION_NEIGHBOURS = 0.02, 8
 GRASP_DISTANCE_FRACTION = 0.4  # of the sheet's diagonal; a bar leaves cloth in pieces, and is farther from the grippers
@@ -187,8 +184,8 @@ def make_moving_recording(seed: int, size: MovingSize | None = None) -> MovingRe
     rig = bimanual_rig(model="rizon4", frame="tcp_closed")
     motion, path, joints = _draw_reachable_path(motion_rng, rig, hold, times)
     result, middles = _simulate(scene, hold, path)
-    at_grips = {name: _move_origin(pose, middles[name]) for name, pose in path.pose.items()}
-    seen_poses = {name: _sample_poses(path.t, pose, times) for name, pose in at_grips.items()}
+    at_grips = {name: move_origin(pose, middles[name]) for name, pose in path.pose.items()}
+    seen_poses = {name: sample_poses(path.t, pose, times) for name, pose in at_grips.items()}
     x, v = (CubicSpline(result.t, frames)(times) for frames in (result.x, result.v))
     arms = _arm_meshes(rig, joints, hold, seen_poses)
     observed = _observe(camera_rng, camera_name, scene.sheet, x, arms, seen_poses, rig, size)
@@ -201,7 +198,7 @@ def make_moving_recording(seed: int, size: MovingSize | None = None) -> MovingRe
         licence="CC0-1.0",
         grasps={name: recordings.GraspInfo(points, hold.radius) for name, points in hold.points.items()},
         grippers={
-            name: _report(knots - start, _sample_poses(path.t, pose, knots), robot_rng)
+            name: _report(knots - start, sample_poses(path.t, pose, knots), robot_rng)
             for name, pose in at_grips.items()
         },
         cameras={"cam0": recordings.Camera(**observed.camera.to_calibration())},
@@ -291,9 +288,8 @@ def _draw_reachable_path(
     for _ in range(IK_ATTEMPTS):
         name = str(rng.choice(MOTIONS))
         path = _draw_path(rng, name, hold)
-        tools = {
-            arm: _sample_poses(path.t, _tool_poses(pose, ARM_SIDES[arm]), times) for arm, pose in path.pose.items()
-        }
+        turned = {arm: hold_from_above(p, Swing().tool_rotation(ARM_SIDES[arm])) for arm, p in path.pose.items()}
+        tools = {arm: sample_poses(path.t, pose, times) for arm, pose in turned.items()}
         try:
             joints = _solve(rig, tools)
             measure_joint_usage(rig, times, joints)
@@ -348,21 +344,6 @@ def _draw_path(rng: np.random.Generator, name: str, hold: _Hold) -> _Path:
     return _Path(t, pose)
 
 
-def _tool_poses(pose: Array, side: float) -> Array:
-    """Return the poses [K, 4, 4] m of an arm's tool, which holds the cloth from above."""
-    out = pose.copy()
-    out[:, :3, :3] = pose[:, :3, :3] @ Swing().tool_rotation(side)
-    return out
-
-
-def _sample_poses(t: Array, pose: Array, times: Array) -> Array:
-    """Interpolate poses [K, 4, 4] m at t [K] s by splines, [T, 4, 4] at times [T] s."""
-    out = np.tile(np.eye(4), (len(times), 1, 1))
-    out[:, :3, 3] = CubicSpline(t, pose[:, :3, 3])(times)
-    out[:, :3, :3] = RotationSpline(t, Rotation.from_matrix(pose[:, :3, :3]))(times).as_matrix()
-    return out
-
-
 def _simulate(scene: Scene, hold: _Hold, path: _Path) -> tuple[Result, dict[str, Array]]:
     """Let the sheet settle, then move it; return the motion, and the middle [3] m of what is held, in each gripper."""
     uv, _ = sheet_mesh(scene.sheet)
@@ -376,19 +357,7 @@ def _simulate(scene: Scene, hold: _Hold, path: _Path) -> tuple[Result, dict[str,
         grips[name] = Grip(vertices, path.t, pose)
         at = middle + hold.place(hold.points[name].mean(0, keepdims=True)) @ first.T  # type: ignore[operator]
         middles[name] = (at[0] - pose[0, :3, 3]) @ pose[0, :3, :3]
-    step, terms = stable_step(scene), make_force_terms(scene, on_table=False)
-    settling_terms = [term for term in terms if term.acts_while_settling]
-    settled = MujocoCloth(scene.sheet, step, settling_terms).run(
-        x0, np.array([0.0, HANGING_SETTLING_S]), hold_grips(grips), damping_rate=SETTLING_DAMPING_PER_S
-    )
-    return MujocoCloth(scene.sheet, step, terms).run(settled.x[-1], path.t, grips), middles
-
-
-def _move_origin(pose: Array, place: Array) -> Array:
-    """Return poses [K, 4, 4] m with their origin at a place [3] m in the gripper."""
-    out = pose.copy()
-    out[:, :3, 3] += pose[:, :3, :3] @ place
-    return out
+    return settle_and_move(scene, x0, grips, path.t), middles
 
 
 # -- what is recorded -------------------------------------------------------------------------------------------------
@@ -455,8 +424,8 @@ def _observe(
 ) -> _Observed:
     """Take depth images of everything, and cut the cloth out of them."""
     faces = sheet_mesh(sheet)[1]
-    camera = _place_camera(rng, name, x, next(iter(poses.values()))[len(x) // 2], size.shrink)
-    noise = observe.DepthNoise.azure_kinect() if name == "kinect" else CALIBRATED_STEREO_NOISE
+    camera = shrink_camera(place_camera(rng, name, x, AZIMUTH_RANGE_RAD), size.shrink)
+    noise = make_camera_noise(name)
     view = observe.View(camera, noise).with_bias(rng)
     grips = np.concatenate([pose[:, :3, 3] for pose in poses.values()])
     reach = float(np.hypot(sheet.width, sheet.height)) + WORKSPACE_MARGIN_M
@@ -475,7 +444,7 @@ def _observe(
     pixels = np.zeros((camera.height, camera.width), bool)
     stride = max(1, PIXEL_STRIDE // size.shrink)
     pixels[::stride, ::stride] = True
-    background = [*observe.build_solid_meshes([rig.table.primitive()]), *_room()]  # type: ignore[union-attr]
+    background = [*observe.build_solid_meshes([rig.table.primitive()]), *build_room()]  # type: ignore[union-attr]
     bar_width, tilt = rng.uniform(*BAR_WIDTH_RANGE), BAR_TILT_STD_RAD * rng.standard_normal()
     direction = rng.choice([-1.0, 1.0])
     clouds, occluded, removed, foreign = [], [], [], []
@@ -496,35 +465,6 @@ def _observe(
     return _Observed(
         camera, clouds, counts, *(float(np.mean(share or [0.0])) for share in (occluded, removed, foreign))
     )
-
-
-def _place_camera(rng: np.random.Generator, name: str, x: Array, pose: Array, shrink: int) -> observe.DepthCamera:
-    """Return a camera that looks at the cloth's middle from the side away from the arms."""
-    target = (x.min((0, 1)) + x.max((0, 1))) / 2
-    azimuth = rng.uniform(-AZIMUTH_RANGE_RAD, AZIMUTH_RANGE_RAD)
-    elevation, distance = rng.uniform(*ELEVATION_RANGE_RAD), rng.uniform(*DISTANCE_RANGE_M[name])
-    flat = np.cos(elevation)
-    away = np.array([flat * np.cos(azimuth), flat * np.sin(azimuth), np.sin(elevation)])
-    T_world_camera = observe.look_at(target + distance * away, target)
-    make = observe.DepthCamera.azure_kinect_nfov if name == "kinect" else observe.DepthCamera.realsense_d435
-    camera = make(T_world_camera)
-    if shrink == 1:
-        return camera
-    K = camera.K / shrink
-    K[2, 2] = 1.0
-    return observe.DepthCamera(
-        camera.width // shrink, camera.height // shrink, K, T_world_camera, camera.range, camera.distortion
-    )
-
-
-def _room() -> list[Mesh]:
-    """Return a wall behind the arms and the floor."""
-    wall, floor = np.eye(4), np.eye(4)
-    wall[0, 3], floor[2, 3] = WALL_X_M, FLOOR_Z_M
-    return [
-        observe.build_solid_mesh("box", (0.02, 6.0, 4.0), wall),
-        observe.build_solid_mesh("box", (6.0, 6.0, 0.02), floor),
-    ]
 
 
 def _bar(camera: observe.DepthCamera, x: Array, width: float, place: float, tilt: float) -> Mesh:

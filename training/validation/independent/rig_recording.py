@@ -337,10 +337,7 @@ def _with_cloud_faults(
         shots = np.split(clouds.xyz, np.cumsum(clouds.counts)[:-1])
         clouds = PointClouds(clouds.t, np.concatenate([shots[i] for i in source]), clouds.counts[source])
     if rig.jitter:
-        # a frame is stamped when it comes through; the order of frames remains
-        late = np.sort(clouds.t + rig.jitter * rng.standard_normal(frames))
-        steps = np.maximum(np.diff(late), MIN_STAMP_STEP_S)
-        stamps = np.maximum(late[0], 0.0) + np.concatenate([[0.0], np.cumsum(steps)])
+        stamps = jitter_stamps(clouds.t, rig.jitter, rng)
         clouds = PointClouds(stamps, clouds.xyz, clouds.counts)
     if rig.has_gaps:
         remains = rng.random(frames) >= DROPPED_FRACTION
@@ -348,6 +345,16 @@ def _with_cloud_faults(
         remains[0] = True
         clouds, source = clouds.select(remains), source[remains]
     return clouds, source
+
+
+def jitter_stamps(t: Array, std: float, rng: np.random.Generator) -> Array:
+    """Return the stamps [T] s of frames at times t [T] s, each off by ``std`` s.
+
+    A frame is stamped when it comes through. The order of the frames remains.
+    """
+    late = np.sort(t + std * rng.standard_normal(len(t)))
+    steps = np.maximum(np.diff(late), MIN_STAMP_STEP_S)
+    return np.maximum(late[0], 0.0) + np.concatenate([[0.0], np.cumsum(steps)])
 
 
 def _add_finger_points(clouds: PointClouds, recording: Recording, rng: np.random.Generator) -> PointClouds:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -175,6 +176,16 @@ def simulate(scene: Scene, motion: Motion, step: float | None = None) -> Result:
     )
     terms = make_force_terms(scene, motion.on_table)
     return MujocoCloth(scene.sheet, dt, terms).run(settled.x[-1], motion.t, grips)
+
+
+def settle_and_move(scene: Scene, x0: Array, grips: Mapping[str, Grip], t: Array) -> Result:
+    """Let cloth that hangs freely settle from positions x0 [V, 3] m, then move its grips; frames are at t [T] s."""
+    step, terms = stable_step(scene), make_force_terms(scene, on_table=False)
+    settling_terms = [term for term in terms if term.acts_while_settling]
+    settled = MujocoCloth(scene.sheet, step, settling_terms).run(
+        x0, np.array([0.0, HANGING_SETTLING_S]), hold_grips(grips), damping_rate=SETTLING_DAMPING_PER_S
+    )
+    return MujocoCloth(scene.sheet, step, terms).run(settled.x[-1], t, grips)
 
 
 def resample_evenly(scene: Scene, x: Array) -> Array:

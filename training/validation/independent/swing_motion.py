@@ -6,6 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
+from scipy.interpolate import CubicSpline
+from scipy.spatial.transform import Rotation, RotationSpline
 
 from torchcloth.errors import InvalidInput
 from torchcloth.robots import Scene  # pyright: ignore[reportMissingImports] - mapped from robots/
@@ -81,6 +83,28 @@ def smooth_ramp(t: Array, start: float, end: float) -> Array:
     """Return 0 before ``start``, 1 after ``end``, and a quintic between: velocity and acceleration do not jump."""
     s = np.clip((t - start) / (end - start), 0, 1)
     return s**3 * (10 - 15 * s + 6 * s * s)
+
+
+def hold_from_above(pose: Array, tool_rotation: Array) -> Array:
+    """Return the poses [K, 4, 4] m of a tool that holds the cloth from above, turned against what it holds."""
+    out = pose.copy()
+    out[:, :3, :3] = pose[:, :3, :3] @ tool_rotation
+    return out
+
+
+def move_origin(pose: Array, place: Array) -> Array:
+    """Return poses [K, 4, 4] m with their origin at a place [3] m in the gripper."""
+    out = pose.copy()
+    out[:, :3, 3] += pose[:, :3, :3] @ place
+    return out
+
+
+def sample_poses(t: Array, pose: Array, times: Array) -> Array:
+    """Interpolate poses [K, 4, 4] m at t [K] s by splines, [T, 4, 4] at times [T] s."""
+    out = np.tile(np.eye(4), (len(times), 1, 1))
+    out[:, :3, 3] = CubicSpline(t, pose[:, :3, 3])(times)
+    out[:, :3, :3] = RotationSpline(t, Rotation.from_matrix(pose[:, :3, :3]))(times).as_matrix()
+    return out
 
 
 def solve_joint_positions(rig: Scene, poses: dict[str, Array]) -> dict[str, Array]:

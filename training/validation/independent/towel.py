@@ -19,10 +19,10 @@ from .air import AirSpec
 from .flex_sheet import SheetSpec, interpolate_bilinear, sheet_mesh
 from .generate import make_recording
 from .motions import CLEARANCE_M, KNOT_PERIOD_S, PIVOT_M, STANDSTILL_S, Motion, minimum_jerk
-from .mujoco_cloth import Grip, MujocoCloth, Result, hold_grips
+from .mujoco_cloth import Grip, Result
 from .plate import PlateSpec
 from .rig_recording import RigRecording, true_parameters, without_extras
-from .scene import HANGING_SETTLING_S, SETTLING_DAMPING_PER_S, GripSpec, Scene, make_force_terms, stable_step
+from .scene import GripSpec, Scene, settle_and_move
 from .sensor import SensorSpec, depth_error_modes
 
 Array = np.ndarray
@@ -117,12 +117,7 @@ def _simulate(case: str, scene: Scene, motion: Motion) -> Result:
     uv, _ = sheet_mesh(scene.sheet)
     vertices = np.flatnonzero(uv[:, 1] > HEIGHT_M - 1e-9) if case == "bar" else np.array([len(uv) - 1])
     grips = {case: Grip(vertices, motion.t, motion.pose[case])}
-    step, terms = stable_step(scene), make_force_terms(scene, on_table=False)
-    times = np.array([0.0, HANGING_SETTLING_S])
-    settled = MujocoCloth(scene.sheet, step, [term for term in terms if term.acts_while_settling]).run(
-        motion.initial_shape(uv), times, hold_grips(grips), damping_rate=SETTLING_DAMPING_PER_S
-    )
-    return MujocoCloth(scene.sheet, step, terms).run(settled.x[-1], motion.t, grips)
+    return settle_and_move(scene, motion.initial_shape(uv), grips, motion.t)
 
 
 def _first_shape_from_depth(scene: Scene, x: Array, clouds: PointClouds, uv: Array) -> Array:
