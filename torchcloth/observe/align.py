@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 import torch
@@ -13,7 +14,7 @@ from torch import Tensor
 from ..errors import InvalidInput
 from ..losses import find_closest_points
 from ..meshes import Mesh
-from .least_squares import Equations, solve_moves
+from .least_squares import Equations, expand_to_axes, solve_moves
 from .rigid import Pose, register_rigidly
 from .shape_prior import ShapePrior
 from .surface_equations import surface_equations
@@ -33,6 +34,8 @@ GOOD_RMS_RATIO = 1.5  # rms distance over noise, below which no other pose is tr
 MAX_RMS_RATIO = 4.0  # rms distance over noise, above which the alignment is refused
 MAX_EDGE_STRAIN = 0.15
 MIN_COVERAGE = 0.3  # share of the visible area that has points
+HELD_PLACE_STD_M = 0.005  # of a place that a robot holds, as the camera sees it
+MAX_HELD_DISTANCE_M = 0.06  # of a held vertex from its place, in a pose from which the mesh is bent
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,6 +65,7 @@ def align(
     viewpoint: ArrayLike | None = None,
     noise: float = 0.002,
     strain: float = 0.01,
+    held: Sequence[int] | np.ndarray = (),
 ) -> Alignment:
     """Lay a mesh onto a point cloud that shows one side of it.
 
@@ -78,6 +82,8 @@ def align(
             points, and layers that are nearer to each other than the fit is to them may be confused.
         noise: m, standard deviation of a point.
         strain: standard deviation of the strain of an edge.
+        held: [H] vertices that are at their places in ``start``, to 5 mm. Poses that take them elsewhere are left out,
+            and the start itself is tried.
 
     Raises:
         InvalidInput: shapes that do not fit, or a cloud that the mesh cannot be laid on.
@@ -87,9 +93,15 @@ def align(
         torch.randperm(len(cloud_points), generator=torch.Generator().manual_seed(0))[:MAX_ALIGNMENT_POINTS]
     ]
     eye = None if viewpoint is None else _eye(viewpoint)
+    held_vertices = torch.as_tensor(np.asarray(held, dtype=np.int64))
+    poses = register_rigidly(x, torch.as_tensor(mesh.faces), cloud_points)
+    if len(held_vertices):
+        poses = [pose for pose in poses if _held_distance(pose, x[held_vertices]) <= MAX_HELD_DISTANCE_M]
+        poses.append(Pose(torch.eye(3, dtype=x.dtype), x.new_zeros(3)))
     alignments = []
-    for pose in register_rigidly(x, torch.as_tensor(mesh.faces), cloud_points):
-        x_bent = _bend(mesh, pose.transform(x), cloud_points, points, eye, noise, strain)
+    for pose in poses:
+        pull = partial(_held_equations, held_vertices, x[held_vertices])
+        x_bent = _bend(mesh, pose.transform(x), cloud_points, points, eye, noise, strain, pull)
         alignments.append(_measure_alignment(mesh, x_bent, pose, cloud_points, points, eye, noise))
         if alignments[-1].rms <= GOOD_RMS_RATIO * noise:
             break
@@ -98,7 +110,27 @@ def align(
     return best
 
 
-def _bend(mesh: Mesh, x: Tensor, cloud: Tensor, points: Tensor, eye: Tensor | None, noise: float, strain: float):
+def _held_distance(pose: Pose, places: Tensor) -> float:
+    """Largest distance [m] by which a pose moves places [H, 3] m."""
+    return float((pose.transform(places) - places).norm(dim=-1).max())
+
+
+def _held_equations(vertices: Tensor, places: Tensor, x: Tensor) -> list[Equations]:
+    """Held vertices [H] are at their places [H, 3] m."""
+    weight = x.new_full((len(vertices), 1), 1 / HELD_PLACE_STD_M)
+    return expand_to_axes(vertices.unsqueeze(-1), weight, (places - x[vertices]) / HELD_PLACE_STD_M)
+
+
+def _bend(
+    mesh: Mesh,
+    x: Tensor,
+    cloud: Tensor,
+    points: Tensor,
+    eye: Tensor | None,
+    noise: float,
+    strain: float,
+    pull: Callable[[Tensor], list[Equations]],
+) -> Tensor:
     """Gauss-Newton from ``x`` [V, 3] m; points and outline are matched anew in every iteration."""
     prior, faces = ShapePrior(mesh, x, strain), torch.as_tensor(mesh.faces)
     spacing = _median_spacing(cloud)
@@ -112,7 +144,7 @@ def _bend(mesh: Mesh, x: Tensor, cloud: Tensor, points: Tensor, eye: Tensor | No
             *surface_equations(x, matched, visible, noise),
             _outline_equations(x, cloud, visible, spacing + noise, outline_radius),
         ]
-        x = x + solve_moves([*data, *prior.equations(x)], len(x))
+        x = x + solve_moves([*data, *prior.equations(x), *pull(x)], len(x))
     return x
 
 
