@@ -29,6 +29,7 @@ STUDY_NAMES: tuple[str, ...] = (
     "screening",
     "fault_injection",
     "honesty",
+    "strangers",
     "air",
     "camera",
     "rgbench",
