@@ -197,7 +197,7 @@ def read_episode(path: Path, run: str) -> Recording:
     edge = np.linspace(0, SHEET_SIDE_M, 31)
     frames = {"all": len(stamps), "rejected by arc length": int((~is_accepted).sum()), "in points": int(use.sum())}
     return Recording(
-        cloth=_cloth_info(data),
+        cloth=describe_cloth(data),
         grasps={"hanger": GraspInfo(np.stack([edge, np.full(31, SHEET_SIDE_M)], -1), 0.006)},
         grippers={"hanger": GripperMotion(t, position, quat, np.ones(len(t), dtype=bool))},
         points=PointClouds(stamps[use], mesh[use][has_depth[use]], has_depth[use].sum(1)),
@@ -212,7 +212,8 @@ def read_episode(path: Path, run: str) -> Recording:
     )
 
 
-def _cloth_info(run: Run) -> ClothInfo:
+def describe_cloth(run: Run) -> ClothInfo:
+    """Describe the sheet and where it hangs at the first frame."""
     density = float(np.prod(DENSITY_GUESSES_KG_PER_M2) ** 0.5)
     return ClothInfo(
         areal_density=density,
