@@ -164,6 +164,6 @@ def test_held_corners_are_not_exchanged(seed):
     u, v = rng.uniform(-0.5, 0.5, (2, 800))
     truth = np.stack([0.3 * u, 0 * u, 0.28 * v], 1)
     cloud = truth + 6e-3 * rng.standard_normal((800, 3)) * [0.1, 1.0, 0.1]
-    held = [int(np.linalg.norm(mesh.uv - corner, axis=1).argmin()) for corner in ((0.0, 0.28), (0.3, 0.28))]
-    result = align(mesh, cloud, start=places, viewpoint=[0.0, -1.0, 0.0], held=held)
+    held_vertices = [int(np.linalg.norm(mesh.uv - corner, axis=1).argmin()) for corner in ((0.0, 0.28), (0.3, 0.28))]
+    result = align(mesh, cloud, start=places, viewpoint=[0.0, -1.0, 0.0], held_vertices=held_vertices)
     assert rms(result.x.numpy() - places) < 5e-3

@@ -73,13 +73,13 @@ def lay_first_shape(recording: Recording, grips: Sequence[SheetGrip], places: np
     cloud = recording.require("points").frame(0)
     eye = next(iter(recording.cameras.values())).T_world_camera[:3, 3]
     # a sheet looks the same with its sides exchanged, and only the grippers tell which corner is whose
-    held = [int(np.linalg.norm(np.asarray(mesh.uv) - grip.place, axis=1).argmin()) for grip in grips]
+    held_vertices = [int(np.linalg.norm(np.asarray(mesh.uv) - grip.place, axis=1).argmin()) for grip in grips]
     starts = hanging_shapes(mesh, grips, places, cloud)
     results, refusal = [], ""
     for noise in ALIGNMENT_NOISE_M:
         for start in starts:
             try:
-                results.append(align(mesh, cloud, start=start, viewpoint=eye, noise=noise, held=held))
+                results.append(align(mesh, cloud, start=start, viewpoint=eye, noise=noise, held_vertices=held_vertices))
             except InvalidInput as error:
                 refusal = str(error)
         if results:

@@ -65,7 +65,7 @@ def align(
     viewpoint: ArrayLike | None = None,
     noise: float = 0.002,
     strain: float = 0.01,
-    held: Sequence[int] | np.ndarray = (),
+    held_vertices: Sequence[int] | np.ndarray = (),
 ) -> Alignment:
     """Lay a mesh onto a point cloud that shows one side of it.
 
@@ -82,8 +82,8 @@ def align(
             points, and layers that are nearer to each other than the fit is to them may be confused.
         noise: m, standard deviation of a point.
         strain: standard deviation of the strain of an edge.
-        held: [H] vertices that are at their places in ``start``, to 5 mm. Poses that take them elsewhere are left out,
-            and the start itself is tried.
+        held_vertices: [H], they are at their places in ``start``, to 5 mm. Poses that take them elsewhere are left
+            out, and the start itself is tried.
 
     Raises:
         InvalidInput: shapes that do not fit, or a cloud that the mesh cannot be laid on.
@@ -93,14 +93,14 @@ def align(
         torch.randperm(len(cloud_points), generator=torch.Generator().manual_seed(0))[:MAX_ALIGNMENT_POINTS]
     ]
     eye = None if viewpoint is None else _eye(viewpoint)
-    held_vertices = torch.as_tensor(np.asarray(held, dtype=np.int64))
+    grasped = torch.as_tensor(np.asarray(held_vertices, dtype=np.int64))
     poses = register_rigidly(x, torch.as_tensor(mesh.faces), cloud_points)
-    if len(held_vertices):
-        poses = [pose for pose in poses if _held_distance(pose, x[held_vertices]) <= MAX_HELD_DISTANCE_M]
+    if len(grasped):
+        poses = [pose for pose in poses if _held_distance(pose, x[grasped]) <= MAX_HELD_DISTANCE_M]
         poses.append(Pose(torch.eye(3, dtype=x.dtype), x.new_zeros(3)))
     alignments = []
     for pose in poses:
-        pull = partial(_held_equations, held_vertices, x[held_vertices])
+        pull = partial(_held_equations, grasped, x[grasped])
         x_bent = _bend(mesh, pose.transform(x), cloud_points, points, eye, noise, strain, pull)
         alignments.append(_measure_alignment(mesh, x_bent, pose, cloud_points, points, eye, noise))
         if alignments[-1].rms <= GOOD_RMS_RATIO * noise:

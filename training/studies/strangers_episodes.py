@@ -32,7 +32,7 @@ from .honesty import run_command
 
 Array = np.ndarray
 FAST_SIZE = BenchSize(spacing=0.03, rate=10.0, shrink=4)
-SURFACE_NODES = 101  # along each side of the dense surface from which points are measured
+DENSE_NODES = 101  # along each side of the dense surface from which points are measured
 FOREIGN_DISTANCE_M = 0.03  # from the true surface, beyond which a point is none of the cloth
 CHECKED_CLOUDS = 10
 FILE_OPTIONS = ("--joints", "--base", "--depth", "--intrinsics", "--camera-pose")
@@ -105,7 +105,7 @@ def measure_quality(recording: recordings.Recording, truth: Path, has_two_sides:
     sheet = SheetSpec(width, height, (len(lines_u), len(lines_v)), lines_u=tuple(lines_u), lines_v=tuple(lines_v))
     x = x @ T[:3, :3].T + T[:3, 3]
     clouds, since_first = recording.require("points"), stamps - stamps[0]
-    grid = np.meshgrid(np.linspace(0, width, SURFACE_NODES), np.linspace(0, height, SURFACE_NODES))
+    grid = np.meshgrid(np.linspace(0, width, DENSE_NODES), np.linspace(0, height, DENSE_NODES))
     dense = np.stack([axis.ravel() for axis in grid], 1)
     distances = []
     for i in np.unique(np.linspace(0, len(clouds) - 1, CHECKED_CLOUDS).astype(int)):

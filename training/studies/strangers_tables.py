@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from ..validation.independent.stranger_bench import HOLDINGS
 from .fabric_tables import NO_VALUE, make_table
 from .honesty import PARAMETER_SYMBOLS, SUMMARY_HEADINGS, Answers, summarise, to_markdown
+
+if TYPE_CHECKING:
+    from rich.console import Console
 
 DRAG = "air.normal"
 STIFFNESSES = ("membrane_stiffness", "bending.stiffness")
@@ -71,28 +74,33 @@ def quality_rows(episodes: Mapping[int, Mapping[str, Any]]) -> list[tuple[str, .
                 f"{1e3 * quality['first_shape_m']:.1f}",
                 f"{1e3 * quality['clock_s']:+.0f}",
             )
-        held = HOLDING_WORDS[episode["holding"]]
-        rows.append((str(seed), held, episode["camera"], *numbers, *(f"{value:.0f}" for value in seconds)))
+        holding = HOLDING_WORDS[episode["holding"]]
+        rows.append((str(seed), holding, episode["camera"], *numbers, *(f"{value:.0f}" for value in seconds)))
     return rows
 
 
 def print_tables(answers: Answers, episodes: Mapping[int, Mapping[str, Any]]) -> None:
     """Print how far the episodes are from the truth, and the scores where there are fits."""
     from rich.console import Console
-    from rich.markup import escape
 
     console = Console(highlight=False)
     console.width = max(console.width, 190)
-    tables = [("Episodes of torchcloth new against the truth", QUALITY_HEADINGS, quality_rows(episodes), 3)]
+    quality = quality_rows(episodes)
+    _print_table(console, "Episodes of torchcloth new against the truth", QUALITY_HEADINGS, quality, left=3)
     if answers:
-        tables.append(
-            ("Numbers and shares of benches where they are called identifiable", SCORE_HEADINGS, score(answers), 2)
-        )
-    for title, headings, rows, left in tables:
-        table = make_table(title, *headings, left=left)
-        for row in rows:
-            table.add_row(*map(escape, row))
-        console.print(table)
+        scores = score(answers)
+        _print_table(console, "Benches where a number is called identifiable", SCORE_HEADINGS, scores, left=2)
+
+
+def _print_table(
+    console: Console, title: str, headings: Sequence[str], rows: Sequence[Sequence[str]], left: int
+) -> None:
+    from rich.markup import escape
+
+    table = make_table(title, *headings, left=left)
+    for row in rows:
+        table.add_row(*map(escape, row))
+    console.print(table)
 
 
 def write_markdown(answers: Answers, episodes: Mapping[int, Mapping[str, Any]]) -> str:

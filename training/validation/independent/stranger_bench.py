@@ -276,8 +276,8 @@ def make_bench(seed: int, size: BenchSize | None = None) -> StrangerBench:
     rig = _make_rig(holding)
     t, poses, joints = _draw_reachable_path(motion_rng, rig, holding, motion, scene.sheet)
     origin = np.zeros(3)
-    held = {name: move_origin(pose, faults.gripper_shift.get(name, origin)) for name, pose in poses.items()}
-    result = _simulate(scene_rng, scene, holding, faults.held_depth, t, held)
+    paths = {name: move_origin(pose, faults.gripper_shift.get(name, origin)) for name, pose in poses.items()}
+    result = _simulate(scene_rng, scene, holding, faults.held_depth, t, paths)
     light_times, stamps = _draw_stamps(time_rng, float(t[-1]), size.rate, faults)
     x = CubicSpline(result.t, result.x)(light_times)
     margin = np.arange(1, round(ROBOT_LOG_MARGIN_S / KNOT_PERIOD_S) + 1) * KNOT_PERIOD_S
@@ -295,7 +295,7 @@ def make_bench(seed: int, size: BenchSize | None = None) -> StrangerBench:
         rig,
         np.concatenate([t[0] - margin[::-1], t, t[-1] + margin]),
         {name: np.pad(q, (repeats, (0, 0)), mode="edge") for name, q in joints.items()},
-        {name: sample_poses(t, pose, light_times) for name, pose in held.items()},
+        {name: sample_poses(t, pose, light_times) for name, pose in paths.items()},
         light_times,
         stamps,
         x,
