@@ -103,6 +103,18 @@ def test_what_lies_inside_the_robot_is_the_robots():
     assert segment(points, stages, robot=solids).indices.tolist() == [4, 5]
 
 
+def test_points_around_several_solids_are_judged_as_by_each_solid_alone():
+    rng = np.random.default_rng(0)
+    points = rng.uniform(-0.5, 0.5, (2000, 3))
+    solids = [build_solid_mesh("sphere", (0.1,), pose(x, 0.0, 0.1)) for x in (-0.3, 0.0, 0.25)]
+    centres = np.array([[-0.3, 0.0, 0.1], [0.0, 0.0, 0.1], [0.25, 0.0, 0.1]])
+    distance = np.linalg.norm(points[:, None] - centres, axis=-1).min(1) - 0.1
+    stages = Segmentation(max_depth_step=None, robot_margin=0.03, outlier_neighbours=None, cluster_gap=None)
+    remains = np.isin(np.arange(len(points)), segment(points, stages, robot=solids).indices)
+    is_clear = np.abs(distance - 0.03) > 3e-3  # the mesh lies a little inside the sphere
+    assert np.array_equal(remains[is_clear], (distance > 0.03)[is_clear])
+
+
 def test_images_of_another_size_are_refused():
     depth = np.zeros((CAMERA.height, CAMERA.width))
     for wrong in ({"depth": depth[:-1]}, {"mask": depth[:, 1:] > 0}, {"colors": depth}):

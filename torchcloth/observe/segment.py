@@ -229,8 +229,8 @@ def segment(
         cloud.keep("crop", lambda p, _: _is_in_workspace(p, stages))
     if stages.hsv_range is not None:
         cloud.keep("color", lambda _, index: _has_color(np.asarray(colors)[index], stages))
-    if stages.robot_margin and len(robot):
-        cloud.keep("robot", lambda p, _: _signed_distance(p, robot) > (stages.robot_margin or 0))
+    if (margin := stages.robot_margin) and len(robot):
+        cloud.keep("robot", lambda p, _: _signed_distance(p, robot, margin) > margin)
     table = _find_table(cloud.points, stages)
     if table is not None:
         cloud.keep("table", lambda p, _: p @ table[:3] + table[3] > stages.table_margin)
@@ -294,17 +294,24 @@ def _has_color(colors: Array, stages: Segmentation) -> Array:
     return good
 
 
-def _signed_distance(points: Array, meshes: Sequence[Mesh]) -> Array:
-    """Distance [N] m to the nearest solid, negative inside. Each solid is a scene of its own, for solids overlap."""
+def _signed_distance(points: Array, meshes: Sequence[Mesh], limit: float) -> Array:
+    """Distance [N] m to the nearest solid, negative inside; inf beyond the limit, where it need not be computed.
+
+    Each solid is a scene of its own, for solids overlap.
+    """
     o3d, distance = import_open3d(), np.full(len(points), np.inf, np.float32)
-    queries = o3d.core.Tensor(points.astype(np.float32))
     for vertices, faces in meshes:
+        low, high = np.min(vertices, axis=0) - limit, np.max(vertices, axis=0) + limit
+        is_near = np.all((points >= low) & (points <= high), axis=1)
+        if not is_near.any():
+            continue
         scene = o3d.t.geometry.RaycastingScene()
         scene.add_triangles(
             o3d.core.Tensor(np.ascontiguousarray(vertices, np.float32)),
             o3d.core.Tensor(np.ascontiguousarray(faces, np.uint32)),
         )
-        distance = np.minimum(distance, scene.compute_signed_distance(queries).numpy())
+        queries = o3d.core.Tensor(points[is_near].astype(np.float32))
+        distance[is_near] = np.minimum(distance[is_near], scene.compute_signed_distance(queries).numpy())
     return distance
 
 
