@@ -12,7 +12,8 @@ from torchcloth.episodes.unknowns import collect_unknowns
 from torchcloth.errors import InvalidInput
 from torchcloth.identification import build_episode, identify
 from torchcloth.identification.estimators.objective import Objective
-from torchcloth.identification.nuisances import NUISANCE_KINDS, select_nuisances
+from torchcloth.identification.nuisances import GRIP_EXTENT_STD_RADII, NUISANCE_KINDS, select_nuisances
+from torchcloth.identification.residuals.blocks import select_blocks
 
 EVERY = ("clock", "camera", "tare", "grasp", "shape")
 
@@ -70,6 +71,29 @@ def test_a_turned_grip_turns_what_it_holds_and_leaves_what_is_far(pulled):
         assert float(fields[1].norm(dim=-1)[lever.argmax()] / lever.max()) < 0.1
     with pytest.raises(InvalidInput, match="rad"):
         select_nuisances({"grasp_turn": -1.0})
+
+
+def test_how_far_a_grip_reaches_has_its_slope_and_its_limits(pulled, monkeypatch):
+    """Against central differences of markers and forces; the meshes of different reaches differ."""
+    radius = 0.03
+    monkeypatch.setattr(stretched_sheets, "GRASP_RADIUS_M", radius)
+    model = stretched_sheets.build_start_cloth(pulled)
+    seen = build_episode(model, pulled).first_fraction(0.3)
+    blocks = select_blocks(["markers", "force"])
+    unknowns = collect_unknowns(model, ["youngs_modulus"], None)
+    result = Objective(model, unknowns, [seen], 4e-4, select_nuisances(["grip"]), blocks)
+    assert result.nuisance_slices[0][0].names == ["grip.left", "grip.right"]
+    assert result.prior_std[1:].tolist() == pytest.approx([GRIP_EXTENT_STD_RADII * radius] * 2)
+    raw = result.start.clone()
+    raw[1] = 1e-3
+    exact = result.linearise(raw)
+    for k in (1, 2):
+        step = torch.zeros_like(raw)
+        step[k] = 5e-4
+        slope = (result.evaluate(raw + step)[0] - result.evaluate(raw - step)[0]) / 1e-3
+        assert float((slope - exact.jacobian[:, k]).norm()) < 0.1 * float(slope.norm()) != 0
+    raw[1:] = torch.tensor([-1.0, 1.0])
+    assert result.clip(raw)[1:].tolist() == pytest.approx([-0.7 * radius, 0.7 * radius])
 
 
 def test_a_first_shape_that_was_not_measured_does_not_settle(pulled):
@@ -159,7 +183,7 @@ def test_names_and_deviations():
     assert [(n.name, n.std) for n in result] == [("clock", 0.4), ("camera", 0.002), ("rim", 0.002)]
     assert select_nuisances({"rim": 0}, implied=["rim"]) == []
     assert select_nuisances(()) == []
-    with pytest.raises(InvalidInput, match=r"nuisance; got 'clok'; expected one of clock, camera"):
+    with pytest.raises(InvalidInput, match=r"nuisance; got 'clok'; expected one of clock, jitter, camera"):
         select_nuisances(["clok"])
     with pytest.raises(InvalidInput, match="nuisance clock; got -1"):
         select_nuisances({"clock": -1.0})

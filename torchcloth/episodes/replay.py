@@ -9,6 +9,7 @@ import torch
 import torch.autograd.forward_ad as forward_ad
 from torch import Tensor, nn
 
+from .._utils.linalg import differentiate_hermite, interpolate_hermite
 from ..cloth import Cloth
 from ..parameters import call_with_parameters
 from ..simulation.sensitivities import Directions
@@ -127,6 +128,21 @@ def map_frames(frames: Frames, function: Callable[[Tensor], Tensor]) -> Frames:
     """Apply a function to every tensor of some frames."""
     wrench = {name: function(w) for name, w in frames.wrench.items()}
     return Frames(function(frames.x), function(frames.v), wrench, function(frames.rim_offset))
+
+
+def see_at(frames: Frames, times: Tensor, shift: Tensor) -> Frames:
+    """Return frames as they are ``shift`` after their times; also derivatives of frames, with K in front.
+
+    Between the frames the cloth follows cubics through their velocities; outside of the frames it rests.
+
+    Args:
+        frames: at ``times``.
+        times: [T] s.
+        shift: [T], or [1] for all frames, s.
+    """
+    t = (times - times[0]).to(frames.x)
+    x, v = (path(t, frames.x, frames.v, t + shift.to(t)) for path in (interpolate_hermite, differentiate_hermite))
+    return frames._replace(x=x, v=v)
 
 
 def frames_from_rollout(rollout: Rollout) -> Frames:

@@ -75,8 +75,11 @@ class Unknown:
 
     @property
     def max_step(self) -> float:
-        """Longest step of one iteration: a factor of 2.7 of a log parameter, half the typical size of an amplitude."""
-        return 0.5 * self.typical_amplitude or 1.0
+        """Longest step of one iteration.
+
+        A factor of 2.7 of a log parameter; of an amplitude half its typical size or half its start, whichever is more.
+        """
+        return 0.5 * max(self.typical_amplitude, abs(self.start)) if self.typical_amplitude else 1.0
 
     @property
     def typical_change(self) -> float:

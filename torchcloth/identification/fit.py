@@ -306,6 +306,7 @@ def _assemble_result(
         "points_noise": noise_std,
         "stable_step": full.cloth.stable_step(),
         "converged": final.converged,
+        "stamp_std": 0.0 if full.frame_times is None else full.frame_times.std,
         **_observation_entries(used, final),
         **mesh_entries,
     }

@@ -14,16 +14,17 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from .._utils.linalg import differentiate_hermite, interpolate_hermite
 from ..boundaries import Grasp
 from ..cloth import Cloth
+from ..episodes.grip_patch_mesh import grip_extent_range, grip_patches
 from ..episodes.observed import Episode
-from ..episodes.replay import Frames
+from ..episodes.replay import Frames, see_at
 from ..errors import InvalidInput
 
 CAMERA_TURN_LEVER_M = 0.1  # distance at which a turned camera is off by as much as a shifted one
 GRASP_TURN_REACH = 0.25  # of the cloth's extent, over which the fabric around a grip turns along
 AXIS_NAMES = "xyz"
+GRIP_EXTENT_STD_RADII = 0.4  # of the patch that a gripper holds, in radii of the stated one
 MAX_CLOCK_OFFSET_STDS = 2.0  # for which a simulation goes on after the last frame
 
 
@@ -58,6 +59,10 @@ class AbstractNuisance(ABC):
         """Return the standard deviation of each number's prior."""
         return [self.std] * len(self.number_names(cloth, episode))
 
+    def bounds(self, cloth: Cloth, episode: Episode) -> list[tuple[float, float]]:
+        """Return the least and the largest value of each number."""
+        return [(-math.inf, math.inf)] * len(self.number_names(cloth, episode))
+
     def initial_shape_modes(self, cloth: Cloth, episode: Episode) -> Tensor | None:
         """Return how the numbers move the cloth at the first frame, [k, V, 3] m per unit; None: not at all."""
         return None
@@ -81,10 +86,31 @@ class ClockOffset(AbstractNuisance):
         return [""]
 
     def observe(self, frames: Frames, values: Tensor, episode: Episode) -> Frames:
-        """Interpolate between frames by cubics through their velocities; outside of the frames the cloth rests."""
-        t = (episode.times - episode.times[0]).to(frames.x)
-        x, v = (path(t, frames.x, frames.v, t + values[0]) for path in (interpolate_hermite, differentiate_hermite))
-        return frames._replace(x=x, v=v)
+        """See every frame later, or earlier where the offset is negative."""
+        return see_at(frames, episode.times, values)
+
+
+class StampJitter(AbstractNuisance):
+    """Scatter of single stamps of the camera: every frame has a time of its own.
+
+    The times are marginalised frame by frame (``estimators.frame_times``) and are no numbers of the search.
+
+    Args:
+        std: standard deviation of a stamp [s]; None: estimated.
+
+    Attributes:
+        is_estimated: whether the standard deviation comes from the data.
+    """
+
+    name, unit, std = "jitter", "s", 0.03
+
+    def __init__(self, std: float | None = None) -> None:
+        super().__init__(std)
+        self.is_estimated = std is None
+
+    def number_names(self, cloth: Cloth, episode: Episode) -> list[str]:
+        """Return no names."""
+        return []
 
 
 class CameraOffset(AbstractNuisance):
@@ -187,6 +213,34 @@ class GraspTurn(AbstractGraspNuisance):
         return torch.cat(turns)
 
 
+class GripExtent(AbstractNuisance):
+    """How much farther out each gripper holds the cloth than the recording says: a hinge holds less, a clamp more.
+
+    What lies within a patch that is stated to be held may turn in the gripper, and what lies beside its pads may be
+    stiff. The same vertices are held, and the pattern is stretched around them, so that they lie at the edge of what is
+    held.
+
+    Args:
+        std: of the prior of each number [m]; None: a fraction of the stated radius.
+    """
+
+    name, unit, std = "grip", "m", math.nan
+
+    def number_names(self, cloth: Cloth, episode: Episode) -> list[str]:
+        """Return the grippers whose patch has a place on the pattern."""
+        return list(grip_patches(cloth))
+
+    def stds(self, cloth: Cloth, episode: Episode) -> list[float]:
+        """Return the standard deviations of the priors."""
+        radii = [patch.radius for patch in grip_patches(cloth).values()]
+        return [GRIP_EXTENT_STD_RADII * radius if math.isnan(self.std) else self.std for radius in radii]
+
+    def bounds(self, cloth: Cloth, episode: Episode) -> list[tuple[float, float]]:
+        """Return what the pattern around the patches has room for."""
+        least, most = grip_extent_range(cloth)
+        return [(least * patch.radius, most * patch.radius) for patch in grip_patches(cloth).values()]
+
+
 class FirstStateOffset(AbstractNuisance):
     """Error of the first state: fields along three axes that vanish where the cloth is held.
 
@@ -253,11 +307,13 @@ NUISANCE_KINDS: dict[str, type[AbstractNuisance]] = {
     kind.name: kind
     for kind in (
         ClockOffset,
+        StampJitter,
         CameraOffset,
         ForceTare,
         RimOffset,
         GraspOffset,
         GraspTurn,
+        GripExtent,
         InitialShapeOffset,
         InitialVelocityOffset,
     )
@@ -320,6 +376,7 @@ class NuisanceSlice(NamedTuple):
         names: public names, e.g. "camera.turn_x".
         units: of each number.
         stds: standard deviation of each number's prior.
+        bounds: least and largest value of each number.
     """
 
     nuisance: AbstractNuisance
@@ -327,6 +384,7 @@ class NuisanceSlice(NamedTuple):
     names: list[str]
     units: list[str]
     stds: list[float]
+    bounds: list[tuple[float, float]]
 
 
 def place_nuisances(
@@ -341,7 +399,8 @@ def place_nuisances(
             if parts:
                 names = [f"{nuisance.name}.{part}" if part else nuisance.name for part in parts]
                 units, stds = nuisance.units(cloth, episode), nuisance.stds(cloth, episode)
-                slices.append(NuisanceSlice(nuisance, slice(first, first + len(parts)), names, units, stds))
+                index, bounds = slice(first, first + len(parts)), nuisance.bounds(cloth, episode)
+                slices.append(NuisanceSlice(nuisance, index, names, units, stds, bounds))
                 first += len(parts)
         out.append(slices)
     return out

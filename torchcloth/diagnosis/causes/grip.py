@@ -9,9 +9,9 @@ import torch
 from ...boundaries import Coulomb, Elliptic, Grasp, Plane, Stribeck
 from ...cloth import Cloth
 from ...effects import Adhesion, GripSlip
+from ...episodes.grip_patch_mesh import move_grip_patches
 from ...episodes.world import Hypothesis, World
 from ...recordings import Recording
-from ..data.grip_patch_mesh import move_grip_patches
 
 MIN_FRICTION = 1e-3
 SLIP_THRESHOLD_N = 0.3  # a loose grip yields to larger forces

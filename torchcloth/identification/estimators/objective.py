@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
@@ -13,20 +14,24 @@ from torch import Tensor
 from ..._utils.resume import ResumableStore, digest
 from ...cloth import Cloth
 from ...episodes.cloth_fingerprint import cloth_fingerprint_parts
+from ...episodes.grip_patch_mesh import StretchedCloth, stretch_around_grips
 from ...episodes.observed import Episode
 from ...episodes.observed_surface import build_surface
-from ...episodes.replay import Frames, StateModes, map_frames, simulate, simulate_with_tangents
+from ...episodes.replay import Frames, StateModes, map_frames, see_at, simulate, simulate_with_tangents
 from ...episodes.unknowns import Unknown
 from ...errors import InvalidInput, SimulationDiverged, UnstableStep
 from ...parameters import PhysicalParameter
-from ..nuisances import AbstractNuisance, NuisanceSlice, add_lookahead, place_nuisances
+from ..nuisances import AbstractNuisance, GripExtent, NuisanceSlice, add_lookahead, place_nuisances
 from ..residuals.blocks import BLOCKS_BY_DATA_KIND, RESIDUAL_BLOCKS, Block, check_noise_floors
 from ..residuals.metrics import DistanceMetrics, distance_metrics, force_rms, huber
 from ..residuals.rows import ResidualRows, match_points
 from ..uncertainty.identifiability import ParameterInfluence
 from . import levenberg_marquardt
+from .frame_times import FrameTimes, RowNoise, Scene, estimate_stamp_std
 from .levenberg_marquardt import DEFAULT_NOISE_MODEL, NoiseModelSettings
 
+MAX_REMEMBERED_CLOTHS = 8  # that are gripped otherwise
+GRIP_EXTENT_STEP_STDS = 0.15  # of a finite slope by how far out a gripper holds the cloth
 MAX_REMEMBERED_POINTS = 4  # whose simulated frames are kept in memory
 
 
@@ -50,8 +55,10 @@ class Objective:
         prior_std: [K].
         typical_changes: [K] changes of the unknowns that matter.
         surface: the cloth's surface as data see it.
+        nuisance_bounds: [N, 2], least and largest value of every nuisance's number.
         nuisance_slices: for every episode, where its nuisances stand in the vector of unknowns.
         journal: store of earlier answers, or None.
+        frame_times: errors of single stamps, which are marginalised; None: stamps count as exact.
         simulations: number of simulated episodes so far; one tangent counts as one.
     """
 
@@ -75,14 +82,18 @@ class Objective:
         self.faces = self.surface.faces
         self.nuisance_slices = place_nuisances(self.nuisances, cloth, self.episodes, len(self.unknowns))
         stds = [std for slices in self.nuisance_slices for s in slices for std in s.stds]
+        bounds = [pair for slices in self.nuisance_slices for s in slices for pair in s.bounds]
+        self.nuisance_bounds = torch.tensor(bounds, dtype=torch.float64).reshape(-1, 2)
         zeros = [0.0 for _ in stds]
         self.prior_std = torch.tensor([*(u.prior_std for u in unknowns), *stds], dtype=torch.float64)
         self.typical_changes = torch.tensor([*(u.typical_change for u in unknowns), *stds], dtype=torch.float64)
         self.start = torch.tensor([*(u.start for u in unknowns), *zeros], dtype=torch.float64)
         self.prior_mean = torch.tensor([*(u.prior_mean for u in unknowns), *zeros], dtype=torch.float64)
         self.journal: ResumableStore | None = None
+        self.frame_times: FrameTimes | None = None
         self.simulations = 0
         self._counted_points: set[tuple[float, ...]] = set()
+        self._stretched_cloths: dict[tuple[tuple[str, float], ...], StretchedCloth] = {}
         self._recent_frames: dict[tuple[float, ...], list[Frames]] = {}
         self._last_linearised: tuple[tuple[float, ...], list[tuple[Frames, Frames]]] | None = None
 
@@ -95,13 +106,29 @@ class Objective:
         """Return the objective with other nuisances."""
         return self._with_episodes(self.episodes, nuisances)
 
-    def with_cloth(self, cloth: Cloth) -> Objective:
-        """Return the objective of another model with the same unknowns and vertices; it has no journal."""
-        return Objective(cloth, self.unknowns, self.episodes, self.dt, self.nuisances, self.blocks, self.noise_floors)
+    def with_cloth(self, cloth: Cloth, episodes: Sequence[Episode] | None = None) -> Objective:
+        """Return the objective of another model with the same unknowns; it has no journal.
+
+        Args:
+            cloth: the model.
+            episodes: the same ones for its mesh; None: it has the same vertices.
+        """
+        return self._copy(cloth, self.episodes if episodes is None else episodes, self.nuisances)
+
+    def with_frame_times(self, frame_times: FrameTimes | None) -> Objective:
+        """Return the objective with other errors of single stamps; it goes on counting simulations."""
+        other = copy.copy(self)
+        other.frame_times, other._recent_frames, other._last_linearised = frame_times, {}, None
+        return other
 
     def _with_episodes(self, episodes: Sequence[Episode], nuisances: Sequence[AbstractNuisance]) -> Objective:
-        other = Objective(self.cloth, self.unknowns, episodes, self.dt, nuisances, self.blocks, self.noise_floors)
+        other = self._copy(self.cloth, episodes, nuisances)
         other.journal = self.journal
+        return other
+
+    def _copy(self, cloth: Cloth, episodes: Sequence[Episode], nuisances: Sequence[AbstractNuisance]) -> Objective:
+        other = Objective(cloth, self.unknowns, episodes, self.dt, nuisances, self.blocks, self.noise_floors)
+        other.frame_times = self.frame_times
         return other
 
     @property
@@ -146,7 +173,7 @@ class Objective:
     def clip(self, raw: Tensor) -> Tensor:
         """Return the nearest legal point [K]."""
         legal = [u.clip(float(r)) for u, r in zip(self.unknowns, raw, strict=False)]
-        return torch.cat([torch.tensor(legal, dtype=raw.dtype), raw[len(legal) :]])
+        return torch.cat([torch.tensor(legal, dtype=raw.dtype), raw[len(legal) :].clamp(*self.nuisance_bounds.T)])
 
     def start_with(self, values: Mapping[str, float]) -> Tensor:
         """Return the unconstrained start [K] with some physical values replaced, by parameter name.
@@ -221,11 +248,60 @@ class Objective:
 
     def simulate(self, raw: Tensor, i: int) -> Frames:
         """Simulate episode ``i``; differentiable in reverse mode when ``raw`` [K] requires grad."""
-        fabric, episode = raw[: len(self.unknowns)], self._initial_episode(raw, i)
-        frames = simulate(self.cloth, self.unknowns, fabric, episode, self.dt)
+        frames = self._simulate_cloth(raw, i)
         for s in self.nuisance_slices[i]:
             frames = s.nuisance.observe(frames, raw[s.index].to(frames.x), self.episodes[i])
+        if self.frame_times is not None:
+            frames = see_at(frames, self.episodes[i].times, self.frame_times.find_shifts(frames, self.scene(i)))
         return frames
+
+    def _simulate_cloth(self, raw: Tensor, i: int) -> Frames:
+        """Simulate episode ``i`` as an observer without errors sees it."""
+        cloth, stretched = self._gripped_cloth(raw, i)
+        episode = self._initial_state(raw, i)[0]
+        frames = simulate(cloth, self.unknowns, raw[: len(self.unknowns)], episode, self.dt)
+        return frames if stretched is None else stretched.view(frames)
+
+    def _gripped_cloth(self, raw: Tensor, i: int) -> tuple[Cloth, StretchedCloth | None]:
+        """Return the cloth as it is gripped in episode ``i``, and where the pattern is stretched for that."""
+        wider = self._grip_extents(raw, i)
+        if not any(wider.values()):
+            return self.cloth, None
+        key = tuple(wider.items())
+        if key not in self._stretched_cloths:
+            self._stretched_cloths[key] = stretch_around_grips(self.cloth, wider)
+            while len(self._stretched_cloths) > MAX_REMEMBERED_CLOTHS:
+                del self._stretched_cloths[next(iter(self._stretched_cloths))]
+        return self._stretched_cloths[key].cloth, self._stretched_cloths[key]
+
+    def _grip_extents(self, raw: Tensor, i: int) -> dict[str, float]:
+        """Return by how much farther out each gripper holds the cloth in episode ``i`` [m]."""
+        slices = [s for s in self.nuisance_slices[i] if isinstance(s.nuisance, GripExtent)]
+        names = [name for s in slices for name in s.nuisance.number_names(self.cloth, self.episodes[i])]
+        values = [value for s in slices for value in raw[s.index].tolist()]
+        return dict(zip(names, values, strict=True))
+
+    def estimate_frame_times(self, raw: Tensor, std: float | None) -> FrameTimes | None:
+        """Return the errors of single stamps that the data show at a point; None where they show none.
+
+        Args:
+            raw: [K].
+            std: of a stamp [s]; None: estimated.
+        """
+        exact = self.with_frame_times(None)
+        point = levenberg_marquardt.evaluate_point(self.problem(), raw, exact.evaluate_all(raw))
+        noise = zip(point.scale.tolist(), point.effective_fraction.tolist(), point.outlier_cutoff.tolist(), strict=True)
+        blocks = zip(self.blocks, noise, strict=False)
+        times = FrameTimes(0.0 if std is None else std, {block.name: RowNoise(*n) for block, n in blocks})
+        if std is None:
+            scenes = [self.scene(i) for i in range(len(self.episodes))]
+            times = replace(times, std=estimate_stamp_std(times, exact.observe(raw), scenes))
+        self.simulations += len(self.episodes)
+        return times if times.std > 0 else None
+
+    def scene(self, i: int) -> Scene:
+        """Return what frames of episode ``i`` are compared with."""
+        return Scene(self.episodes[i], self.surface, self.blocks)
 
     def _first_state_modes(self, i: int) -> tuple[list[int], StateModes]:
         """(indices of the unknowns that change the first state, changes by their units)."""
@@ -254,20 +330,55 @@ class Objective:
         initial = episode.initial + torch.einsum("k,kvc->vc", values, modes.x)
         return replace(episode, initial=initial, initial_velocity=velocity)
 
+    def _initial_state(self, raw: Tensor, i: int) -> tuple[Episode, list[int], StateModes]:
+        """Return the episode with its first state, columns that change it, and how, on the gripped cloth's mesh."""
+        episode, (columns, modes) = self._initial_episode(raw, i), self._first_state_modes(i)
+        stretched = self._gripped_cloth(raw, i)[1]
+        if stretched is not None:
+            velocity = episode.initial_velocity
+            velocity = None if velocity is None else stretched.take(velocity)
+            episode = replace(episode, initial=stretched.take(episode.initial), initial_velocity=velocity)
+            modes = StateModes(stretched.take(modes.x), stretched.take(modes.v))
+        return episode, columns, modes
+
     def _tangents(self, raw: Tensor, i: int, by_fabric: bool = True) -> tuple[Frames, Frames]:
         """One episode, and its derivatives by all unknowns; those by the fabric's are zero if not ``by_fabric``."""
-        (mode_columns, modes), episode = self._first_state_modes(i), self._initial_episode(raw, i)
+        episode, mode_columns, modes = self._initial_state(raw, i)
+        cloth, stretched = self._gripped_cloth(raw, i)
         fabric = raw[: len(self.unknowns)]
-        frames, computed = simulate_with_tangents(self.cloth, self.unknowns, fabric, episode, self.dt, modes, by_fabric)
+        frames, computed = simulate_with_tangents(cloth, self.unknowns, fabric, episode, self.dt, modes, by_fabric)
         columns = torch.tensor([*range(len(self.unknowns) if by_fabric else 0), *mode_columns])
+        if stretched is not None:
+            frames, computed = stretched.view(frames), stretched.view(computed)
 
         def spread(d: Tensor) -> Tensor:
             return d.new_zeros(len(raw), *d.shape[1:]).index_copy(0, columns, d)
 
         derivatives = map_frames(computed, spread)
+        self._differentiate_by_grip_extents(raw, i, frames, derivatives)
         for s in self.nuisance_slices[i]:
             frames, derivatives = apply_nuisance(s, frames, derivatives, raw, self.episodes[i])
+        if self.frame_times is not None:
+            times, shift = self.episodes[i].times, self.frame_times.find_shifts(frames, self.scene(i))
+            frames, derivatives = (see_at(f, times, shift) for f in (frames, derivatives))
         return frames, derivatives
+
+    def _differentiate_by_grip_extents(self, raw: Tensor, i: int, frames: Frames, derivatives: Frames) -> None:
+        """Write finite slopes by how far out grippers hold the cloth into derivatives [K, ...]: meshes differ."""
+        for s in self.nuisance_slices[i]:
+            if not isinstance(s.nuisance, GripExtent):
+                continue
+            for k, std in zip(range(s.index.start, s.index.stop), s.stds, strict=True):
+                shifted = raw.detach().clone()
+                shifted[k] += GRIP_EXTENT_STEP_STDS * std
+                if not torch.equal(self.clip(shifted), shifted):
+                    shifted[k] -= 2 * GRIP_EXTENT_STEP_STDS * std
+                step = float(shifted[k] - raw[k])
+                with torch.no_grad():
+                    there = self._simulate_cloth(shifted, i)
+                derivatives.x[k], derivatives.v[k] = (there.x - frames.x) / step, (there.v - frames.v) / step
+                for name, wrench in derivatives.wrench.items():
+                    wrench[k] = (there.wrench[name] - frames.wrench[name]) / step
 
     # -- residuals ------------------------------------------------------------------------------------------------
 
@@ -378,7 +489,7 @@ class Objective:
         """Answer of the journal, if there is one that has it, else of ``compute``."""
         if self.journal is None:
             return compute()
-        frame_counts = digest([(e.observed_count, len(e.times)) for e in self.episodes])
+        frame_counts = digest([*((e.observed_count, len(e.times)) for e in self.episodes), repr(self.frame_times)])
         return self.journal.get_or_compute(f"{question}-{frame_counts}", raw, compute)
 
     def linearise_by_differences(
@@ -403,7 +514,7 @@ class Objective:
         wrenches = [w for _, d in simulated for w in d.wrench.values()]
         forces = [w[:count, 1:, :3].square().sum(-1).mean(1) for w in wrenches]
         force = torch.stack(forces).mean(0) if forces else torch.zeros(count)
-        return self._rows(simulated), ParameterInfluence(position.mean(0).sqrt(), force.sqrt())
+        return self._rows(simulated, followed_by=count), ParameterInfluence(position.mean(0).sqrt(), force.sqrt())
 
     def _simulate_shifted(self, raw: Tensor, k: int, step: float) -> tuple[float, list[Frames]]:
         """(step along an unknown, frames there), backwards where forwards fails; (0, []) where both fail."""
@@ -416,13 +527,20 @@ class Objective:
                     return signed_step, self.observe(shifted)
         return 0.0, []
 
-    def _rows(self, simulated: Sequence[tuple[Frames, Frames | None]]) -> levenberg_marquardt.Linearised:
+    def _rows(
+        self, simulated: Sequence[tuple[Frames, Frames | None]], followed_by: int = 0
+    ) -> levenberg_marquardt.Linearised:
+        """Residual rows; slopes by the first ``followed_by`` unknowns already say that times of frames follow them."""
         parts: list[tuple[int, int, int, ResidualRows]] = []
         first_frame = 0
-        for (frames, derivatives), episode in zip(simulated, self.episodes, strict=True):
-            scene = match_points(frames, derivatives, episode, self.surface)
+        for i, ((frames, derivatives), episode) in enumerate(zip(simulated, self.episodes, strict=True)):
+            if self.frame_times is None or derivatives is None:
+                simulated_episode = match_points(frames, derivatives, episode, self.surface)
+                rows_by_block = {block.name: block.rows(simulated_episode) for block in self.blocks}
+            else:
+                rows_by_block = self.frame_times.project(frames, derivatives, self.scene(i), followed_by)
             for b, block in enumerate(self.blocks):
-                rows = block.rows(scene)
+                rows = rows_by_block[block.name]
                 if rows is not None:
                     parts.append((b, first_frame, self._frames_per_reference_period(episode.times), rows))
             first_frame += len(episode.times) + self.noise_model.frames_per_time_block

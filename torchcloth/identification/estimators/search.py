@@ -9,6 +9,7 @@ from typing import Any, Literal, NamedTuple
 from torch import Tensor
 
 from ...errors import SimulationDiverged, UnstableStep
+from ..nuisances import StampJitter
 from ..uncertainty.consider_covariance import points_misfit, solution_covariance
 from ..uncertainty.estimates import make_estimates
 from ..uncertainty.misfit import find_misfit
@@ -30,6 +31,8 @@ NEAR_OPTIMUM_NOTE = (
 )
 MIN_APPROACH_RATIO = 0.8  # of the misfit that a round of simulations leaves, to that before, for another round
 HOPED_STD_RATIO = 2.0  # by which standard errors may yet fall in more rounds of simulations around a solution
+MAX_STAMP_ROUNDS = 2  # searches that follow a new estimate of the stamps' scatter
+MIN_STAMP_STD_CHANGE = 0.2  # of the scatter of the stamps, for another search
 SAMPLED_FIT_NOTE = "simulations around the solution know what is near, not what is best"
 UNFINISHED_REMEDY = (
     "more iterations of Gauss-Newton, a nearer start or several, or fewer parameters at once may get there"
@@ -100,6 +103,7 @@ class Search:
             early: fit the early frames first.
             count: number of starts.
         """
+        self._estimate_stamps(start)
         full, starts = self.objective, None
         if count > 1:
             starts = self._search_from_several(start, count, iterations)
@@ -109,6 +113,11 @@ class Search:
             start = self._fit_early_frames(part, start, iterations).raw if part.has_data else start
             self.partial_simulations += part.simulations
         final = self._fit_all_frames(method, start, iterations, rate)
+        for _ in range(MAX_STAMP_ROUNDS):
+            if not self._estimate_stamps(final.raw):
+                break
+            full = self.objective
+            final = self._fit_all_frames(method, final.raw, iterations, rate)
         checked = linearity.check_linearity(full, final)
         if checked.is_withdrawn and method not in CHAMFER_METHODS and self.stop != "paper":
             used, checked = self._resolve_unstable(checked, start, iterations)
@@ -125,6 +134,19 @@ class Search:
         elif reason and not checked.is_withdrawn:
             reason = f"{reason}; {NEAR_OPTIMUM_NOTE}"
         return Outcome(used, checked, reason, starts)
+
+    def _estimate_stamps(self, raw: Tensor) -> bool:
+        """Estimate the scatter of the stamps at a point; tell whether it differs from what the search assumed."""
+        objective, before = self.objective, self.objective.frame_times
+        jitter = next((n for n in objective.nuisances if isinstance(n, StampJitter)), None)
+        if jitter is None or not objective.uses("points", "markers") or (before and not jitter.is_estimated):
+            return False
+        after = objective.estimate_frame_times(raw, None if jitter.is_estimated else jitter.std)
+        stds = [0.0 if times is None else times.std for times in (before, after)]
+        if abs(stds[1] - stds[0]) <= MIN_STAMP_STD_CHANGE * max(stds):
+            return False
+        self.objective = objective.with_frame_times(after)
+        return True
 
     def _resolve_unstable(
         self, failed: linearity.LinearityCheck, start: Tensor, iterations: int

@@ -107,9 +107,7 @@ def mesh_correction(objective: Objective, final: levenberg_marquardt.Iterate, sc
         build_episode(cloth, refine_recording(r, coarse.mesh, cloth.mesh)).with_lookahead(e.lookahead)
         for r, e in zip(scene.recordings, objective.episodes, strict=True)
     ]
-    fine = Objective(
-        cloth, objective.unknowns, episodes, objective.dt, objective.nuisances, objective.blocks, objective.noise_floors
-    )
+    fine = objective.with_cloth(cloth, episodes)
     fine_linear, linear = fine.evaluate_all(final.raw), final.linear
     change = torch.zeros_like(linear.residual)
     for b in linear.blocks.unique():

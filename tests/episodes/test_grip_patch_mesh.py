@@ -11,7 +11,7 @@ from torchcloth import diagnosis as dx
 from torchcloth import recordings as rec
 from torchcloth.boundaries import Grasp
 from torchcloth.diagnosis.data.dataset import prepare_data
-from torchcloth.diagnosis.data.grip_patch_mesh import move_grip_patches
+from torchcloth.episodes.grip_patch_mesh import move_grip_patches
 from torchcloth.episodes.observed import build_episode
 from torchcloth.episodes.replay import Frames
 from torchcloth.errors import InvalidInput
