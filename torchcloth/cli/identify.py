@@ -101,8 +101,14 @@ def _add_options(parser: argparse.ArgumentParser) -> None:
         action="extend",
         default=[],
         metavar="NAME[=STD]",
-        help="unknowns of each episode: clock, camera, grasp, shape, tare, rim; STD is the prior's standard deviation, "
-        "e.g. clock=0.02",
+        help="unknowns of each episode: clock, jitter, camera, rim, grasp, grasp_turn, grip, shape, tare; STD is the "
+        "prior's standard deviation, e.g. clock=0.02, and 0 leaves one out",
+    )
+    parser.add_argument(
+        "--exact-bench",
+        action="store_true",
+        help="take stamps, camera, grips and first shape as exact, as in a simulation of one's own; else their errors "
+        "are unknowns",
     )
     parser.add_argument(
         "--prior",
@@ -149,7 +155,7 @@ def _add_options(parser: argparse.ArgumentParser) -> None:
 
 def _demo(options: argparse.Namespace) -> int:
     with resources.as_file(resources.files("torchcloth") / "examples" / DEMO_EPISODE) as folder:
-        options.episodes = [str(folder)]
+        options.episodes, options.exact_bench = [str(folder)], True  # MuJoCo recorded it, without a bench's errors
         return _identify(options)
 
 
@@ -321,6 +327,7 @@ def _fit(options: argparse.Namespace, cloth: Cloth, episodes: list[Recording]) -
             on_progress=advance,
             refine=_should_refine(options),
             checks=options.checks,
+            exact_bench=options.exact_bench,
         )
 
 

@@ -28,7 +28,7 @@ from .estimators.objective import Objective
 from .estimators.search import CHAMFER_METHODS, ESTIMATION_METHODS, Method, Outcome, Progress, Search
 from .fit_warnings import fit_warnings, nuisance_warnings, warn_of_skew
 from .io.saved_fit import describe_model
-from .nuisances import add_lookahead, as_stds, implied_nuisances, select_nuisances
+from .nuisances import add_lookahead, as_stds, bench_nuisances, implied_nuisances, select_nuisances
 from .residuals.blocks import select_blocks
 from .residuals.metrics import distance_metrics, force_rms
 from .residuals.rigid_carry import carry_rigidly, find_unbeaten_null, mean_forces, zero_forces
@@ -79,6 +79,7 @@ def identify(
     on_progress: Progress | None = None,
     refine: bool = False,
     checks: bool = True,
+    exact_bench: bool = False,
     model_errors: ModelErrors = MODEL_ERRORS,
 ) -> Identification:
     """Fit scalar parameters of a cloth to points, markers and forces, by gradients through the simulation.
@@ -101,9 +102,10 @@ def identify(
         warm_start: the guess is near the solution (an interrupted fit): skip the stage on the early frames.
         dt: largest substep [s]; None: the stable one, chosen anew for every set of values.
         use: kinds of data, some of "points", "markers" and "force"; None: all that an episode has.
-        nuisances: what may differ from episode to episode: "clock" [s], "camera" [m], "grasp" [m], "shape" [m], "tare"
-            [N]; as names, or with the standard deviation of the prior, e.g. {"clock": 0.4}. "rim" [m], an offset of
-            the cloud's rim, always joins where there are points, unless it is given as 0.
+        nuisances: what may differ from episode to episode, as names, or with the standard deviation of the prior, e.g.
+            {"clock": 0.4}: "clock" [s], "jitter" of single stamps [s], "camera" [m], "rim" of the cloud [m], "grasp"
+            [m], "grasp_turn" [rad], "grip" [m], "shape" [m], "tare" [N]. Those that every bench has join anyway, unless
+            they are given as 0 (see ``exact_bench``).
         priors: by parameter (value, factor) for positive ones: 68 % within that factor; (value, standard deviation)
             for others. Default: around the start, a factor of 10 for positive parameters, 1 in the logit of 2 nu, twice
             the typical size of amplitudes.
@@ -124,6 +126,9 @@ def identify(
             with ``profile``.
         checks: look for frozen clouds and for a clock that is off (``inspection.corrections``). Frozen clouds are left
             out. A clock that is off is corrected, and becomes a nuisance. The warnings say so.
+        exact_bench: take the stamps, the camera's pose, the grips and the first shape as exact, as in a simulation of
+            one's own. By default "clock", "jitter", "camera", "grasp", "grip" and "shape" join the nuisances where the
+            data have them (``nuisances.bench_nuisances``); "rim" joins always.
         model_errors: what the parameters of two simulators of one cloth differ by; standard errors include it. Zeros
             suit data from this very simulator only.
 
@@ -142,11 +147,9 @@ def identify(
     began = time.perf_counter()
     require_cpu(cloth)
     originals = recordings = check_recordings(recordings)
-    notes, nuisances = [], as_stds(nuisances)
+    notes, clock_std = [], None
     if checks:
         recordings, notes, clock_std = check_all(recordings)
-        if clock_std is not None and method not in CHAMFER_METHODS:
-            nuisances = {"clock": clock_std, **nuisances}
     if refine and profile:
         raise InvalidInput("profile", got="refine as well", expected="one of them: a profile is that of the given mesh")
     fine_scene = FineScene(refine_cloth(cloth), recordings) if refine else None
@@ -162,8 +165,13 @@ def identify(
     blocks = select_blocks(use)
     episodes = [build_episode(cloth, r) for r in recordings]
     _check_has_points(method, stop, episodes)
-    implied = implied_nuisances([block.name for block in blocks], episodes)
-    selected = select_nuisances(nuisances, implied)
+    uses = [block.name for block in blocks]
+    expected: dict[str, float | None] = {}
+    if method == "gauss-newton" and not exact_bench:
+        expected = bench_nuisances(uses, episodes)
+    if clock_std is not None and method not in CHAMFER_METHODS:
+        expected["clock"] = max(clock_std, expected.get("clock") or 0.0)
+    selected = select_nuisances(expected | as_stds(nuisances), implied_nuisances(uses, episodes))
     objective = Objective(cloth, unknowns, add_lookahead(episodes, selected), dt, selected, blocks, noise)
     start = objective.start_with(guess or {})
     if journal is not None:

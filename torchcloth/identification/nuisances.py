@@ -25,6 +25,8 @@ CAMERA_TURN_LEVER_M = 0.1  # distance at which a turned camera is off by as much
 GRASP_TURN_REACH = 0.25  # of the cloth's extent, over which the fabric around a grip turns along
 AXIS_NAMES = "xyz"
 GRIP_EXTENT_STD_RADII = 0.4  # of the patch that a gripper holds, in radii of the stated one
+BENCH_CAMERA_STDS: dict[str, float | None] = {"clock": 0.03, "jitter": None, "camera": 0.004}  # s, s, m
+BENCH_CLOTH_STDS: dict[str, float | None] = {"grasp": None, "grip": None, "shape": 0.004}  # m
 MAX_CLOCK_OFFSET_STDS = 2.0  # for which a simulation goes on after the last frame
 
 
@@ -329,6 +331,22 @@ def implied_nuisances(uses: Collection[str], episodes: Sequence[Episode]) -> lis
     has_points = any(len(cloud) for e in episodes for cloud in e.clouds)
     moves = any(e.initial_velocity is not None for e in episodes)
     return ["rim"] * ("points" in uses and has_points) + ["shape", "velocity"] * moves
+
+
+def bench_nuisances(uses: Collection[str], episodes: Sequence[Episode]) -> dict[str, float | None]:
+    """Return what no recording of a real bench states exactly, with standard deviations; None: the kind's own.
+
+    These are the clock, the stamps of single frames, the camera's pose, where and how far the grippers hold the cloth,
+    and a measured first shape. ``studies strangers`` compares fits with and without them.
+
+    Args:
+        uses: names of the kinds of data in use.
+        episodes: the recordings.
+    """
+    has_camera = any(e.markers is not None or any(map(len, e.clouds)) for e in episodes)
+    is_seen = has_camera and not {"points", "markers"}.isdisjoint(uses)
+    is_measured = any(e.is_first_shape_measured for e in episodes)
+    return (BENCH_CAMERA_STDS if is_seen else {}) | (BENCH_CLOTH_STDS if is_measured else {})
 
 
 def as_stds(wanted: Mapping[str, float | None] | Sequence[str]) -> dict[str, float | None]:

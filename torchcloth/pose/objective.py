@@ -172,7 +172,7 @@ class CorrectedObjective(Objective):
         problem = super().problem()
         max_step = problem.max_step.clone()
         max_step[self.force_slice] = torch.inf
-        return problem._replace(max_step=max_step)
+        return problem._replace(max_step=max_step, reported=None)  # a pose is all of them
 
     def _windows(self, episode: Episode) -> Iterator[tuple[int, Tensor]]:
         """(first frame, frame times) of the windows that the episode has frames of."""

@@ -66,9 +66,9 @@ def remaining_std_errors(
     at: levenberg_marquardt.Iterate,
     criteria: ConvergenceCriteria = CONVERGENCE_CRITERIA,
 ) -> float:
-    """Return the standard errors to the minimum that the slopes predict, from the decrease of the cost there."""
+    """Return how far the minimum is that the slopes predict, in standard errors of the reported unknowns."""
     gradient, hessian = levenberg_marquardt.normal_equations(problem, at)
     reach = criteria.max_prior_stds * problem.prior_std
     low, high = (problem.clip(at.raw + sign * reach) - at.raw for sign in (-1, 1))
     step = solve_box_qp(hessian, -gradient, low, high)
-    return max(0.0, -float(2 * gradient @ step + step @ hessian @ step)) ** 0.5
+    return levenberg_marquardt.step_in_std_errors(problem, hessian, step)

@@ -121,6 +121,7 @@ class Problem(NamedTuple):
         outlier_distance: [B] residuals beyond it and ``outlier_stds`` do not count. None: all count.
         fixed_scales: noise scale, effective fraction and outlier cutoff of every iterate. None: each has its own.
         prior_precision: [K, K] precision of the prior. None: from ``prior_std``, uncorrelated.
+        reported: number of unknowns, the first ones, that must come to rest: others are nuisances. None: all.
         noise_model: assumptions about the noise.
     """
 
@@ -134,6 +135,7 @@ class Problem(NamedTuple):
     outlier_distance: Tensor | None = None
     fixed_scales: tuple[Tensor, Tensor, Tensor] | None = None
     prior_precision: Tensor | None = None
+    reported: int | None = None
     noise_model: NoiseModelSettings = DEFAULT_NOISE_MODEL
 
     @property
@@ -367,9 +369,17 @@ def robust_curvature(problem: Problem, at: Iterate) -> Tensor:
 
 
 def _is_small_step(problem: Problem, at: Iterate, step: Tensor, tolerance: float) -> bool:
-    """Whether a step is below ``tolerance`` standard errors in every direction."""
-    _, hessian = normal_equations(problem, at)
-    return float(step @ hessian @ step) < tolerance**2
+    """Whether a step of the reported unknowns is below ``tolerance`` standard errors in every direction."""
+    return step_in_std_errors(problem, information_matrix(problem, at), step) < tolerance
+
+
+def step_in_std_errors(problem: Problem, information: Tensor, step: Tensor) -> float:
+    """Return how long a step [K] of the reported unknowns is, by their marginal information."""
+    count = len(step) if problem.reported is None else problem.reported
+    here, others = step[:count], information[count:, count:]
+    coupling = information[count:, :count]
+    marginal = information[:count, :count] - coupling.mT @ torch.linalg.solve(others, coupling)
+    return max(0.0, float(here @ marginal @ here)) ** 0.5
 
 
 def _is_near_minimum(problem: Problem, at: Iterate, tolerance: float) -> bool:

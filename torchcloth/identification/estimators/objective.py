@@ -158,6 +158,7 @@ class Objective:
             max_step=torch.tensor(max_step, dtype=torch.float64),
             noise_floor=torch.tensor([self.noise_floor(block) for block in self.blocks], dtype=torch.float64),
             outlier_distance=torch.tensor([block.outlier_distance for block in self.blocks], dtype=torch.float64),
+            reported=len(self.unknowns),
             noise_model=self.noise_model,
         )
 
