@@ -68,7 +68,7 @@ def test_a_fit_that_began_with_a_model_brings_it_along(made, tmp_path):
     """Its effects stay, and its numbers are the fit's."""
     folder, seen, _ = made
     model = folder / "extended.tcm"
-    begun = identify(dx.load_cloth_for(model, seen), seen, ["youngs_modulus"], iterations=1)
+    begun = identify(dx.load_cloth_for(model, seen), seen, ["youngs_modulus"], iterations=1, exact_bench=True)
     path = begun.save(tmp_path / "fit", model)
     cloth, _ = load_fitted_cloth(path, seen, dx.make_start_builder(path))
     assert cloth.effects["air"].normal.value.item() == pytest.approx(TRUE)
@@ -77,7 +77,7 @@ def test_a_fit_that_began_with_a_model_brings_it_along(made, tmp_path):
     assert "mm from the points" in film_from_fit(seen, tmp_path / "fit").title
     with pytest.raises(InvalidInput, match=r"a fit of another model.*give build_start=diagnosis.make_start_builder"):
         load_fitted_cloth(path, seen)
-    plain = identify(build_cloth(seen), seen, ["youngs_modulus"], iterations=1)
+    plain = identify(build_cloth(seen), seen, ["youngs_modulus"], iterations=1, exact_bench=True)
     assert dx.make_start_builder(plain.save(tmp_path / "fit")) is None
 
 

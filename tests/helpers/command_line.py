@@ -10,7 +10,7 @@ from torchcloth import recordings
 from torchcloth.cli import main
 
 COMMAND = [sys.executable, "-m", "torchcloth.cli"]
-QUICK_FIT = ["--fit", "youngs_modulus", "air.normal"]
+QUICK_FIT = ["--fit", "youngs_modulus", "air.normal", "--exact-bench"]
 ENVIRONMENT = {**os.environ, "OMP_NUM_THREADS": "1", "COLUMNS": "80", "PYTHONUNBUFFERED": "1"}
 
 

@@ -46,7 +46,13 @@ def run_twin(seed: int, refine: bool = False) -> dict:
     began = time.process_time()
     model = stretched_sheets.build_start_cloth(recording, youngs_modulus=8e4, poisson_ratio=0.25)
     fit = identify(
-        model, recording, FITTED_PARAMETERS, nuisances={"grasp": 1e-3}, refine=refine, model_errors=SAME_SIMULATOR
+        model,
+        recording,
+        FITTED_PARAMETERS,
+        nuisances={"grasp": 1e-3},
+        refine=refine,
+        model_errors=SAME_SIMULATOR,
+        exact_bench=True,
     )
     line = {"seed": seed, "seconds": time.process_time() - began, "iterations": fit.fit["iterations"]}
     for name, truth in true_values(given).items():

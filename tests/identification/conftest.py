@@ -28,14 +28,14 @@ def model(recording):
 def one_step(recording, brief):
     """A step of the brief episode's stiffness, from the data sheet's."""
     with twins.use_float64():
-        return identify(twins.build_cloth_at(recording), brief, ["youngs_modulus"], iterations=1)
+        return identify(twins.build_cloth_at(recording), brief, ["youngs_modulus"], iterations=1, exact_bench=True)
 
 
 @pytest.fixture(scope="session")
 def plain(recording):
     """Stiffness and air only, from the data sheet's values."""
     with twins.use_float64():
-        return identify(twins.build_cloth_at(recording), recording, ["youngs_modulus", "air.normal"])
+        return identify(twins.build_cloth_at(recording), recording, ["youngs_modulus", "air.normal"], exact_bench=True)
 
 
 @pytest.fixture(scope="session")
@@ -43,7 +43,9 @@ def fitted(recording):
     """(result, what on_progress was called with): everything the model contains, from the data sheet's values."""
     calls = []
     with twins.use_float64():
-        return identify(twins.build_cloth_at(recording), recording, on_progress=lambda *call: calls.append(call)), calls
+        return identify(
+            twins.build_cloth_at(recording), recording, on_progress=lambda *call: calls.append(call), exact_bench=True
+        ), calls
 
 
 @pytest.fixture(scope="session")
@@ -55,4 +57,5 @@ def pair(recording):
             recording,
             ["youngs_modulus", "air.normal"],
             model_errors=twins.SAME_SIMULATOR,
+            exact_bench=True,
         )

@@ -84,7 +84,7 @@ def test_an_interval_ends_where_the_domain_does():
 
 def test_a_profile_replaces_the_interval_and_can_be_resumed(model, brief, tmp_path):
     """Stopped within the profile: what follows is bit by bit what would have been."""
-    options = {"iterations": 4, "guess": {"youngs_modulus": 5e4}, "profile": ["youngs_modulus"]}
+    options = {"iterations": 4, "guess": {"youngs_modulus": 5e4}, "exact_bench": True, "profile": ["youngs_modulus"]}
     calls = []
     whole = identify(model, brief, ["youngs_modulus"], on_progress=lambda *call: calls.append(call), **options)
     profile = whole.profiles["youngs_modulus"]

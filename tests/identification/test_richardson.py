@@ -23,7 +23,7 @@ PAIR = ["youngs_modulus", "air.normal"]
 def corrected(recording):
     """As the fit ``plain``, corrected for its mesh."""
     with twins.use_float64():
-        return identify(twins.build_cloth_at(recording), recording, PAIR, refine=True)
+        return identify(twins.build_cloth_at(recording), recording, PAIR, refine=True, exact_bench=True)
 
 
 def test_the_finer_mesh_is_the_same_cloth(model, recording):
@@ -102,8 +102,8 @@ def test_a_finer_mesh_that_cannot_be_simulated_leaves_the_fit_and_says_so(model,
         raise SimulationDiverged("the cloth is torn apart")
 
     monkeypatch.setattr(fit, "mesh_correction", torn)
-    result = identify(model, brief, ["youngs_modulus"], refine=True)
-    assert result.parameters == identify(model, brief, ["youngs_modulus"]).parameters
+    result = identify(model, brief, ["youngs_modulus"], refine=True, exact_bench=True)
+    assert result.parameters == identify(model, brief, ["youngs_modulus"], exact_bench=True).parameters
     assert "mesh_correction" not in result.fit
     assert any("not corrected for the coarseness of the mesh: on a finer one, the cloth" in w for w in result.warnings)
 
@@ -111,7 +111,7 @@ def test_a_finer_mesh_that_cannot_be_simulated_leaves_the_fit_and_says_so(model,
 def test_it_moves_towards_what_a_finer_mesh_finds(recording, model, plain, corrected):
     """The truth has 11 x 11 vertices, the model 7 x 7; a fit on 13 x 13, which costs eight times as much, judges."""
     fine = refine_cloth(model)
-    judge = identify(fine, refine_recording(recording, model.mesh, fine.mesh), PAIR)
+    judge = identify(fine, refine_recording(recording, model.mesh, fine.mesh), PAIR, exact_bench=True)
     for name in PAIR:
         a, b, c = (fit.parameters[name].value for fit in (plain, corrected, judge))
         assert abs(b - c) < max(0.7 * abs(a - c), 0.3 * judge.parameters[name].std), name
@@ -145,7 +145,7 @@ def test_a_mesh_that_is_fine_already_is_hardly_corrected(recording):
     fine = refine_cloth(twins.build_cloth_at(recording))
     episode = refine_recording(recording, twins.build_cloth_at(recording).mesh, fine.mesh)
     coarse, finer = (
-        identify(c, r, PAIR, refine=True).fit["mesh_correction"]
+        identify(c, r, PAIR, refine=True, exact_bench=True).fit["mesh_correction"]
         for c, r in ((twins.build_cloth_at(recording), recording), (fine, episode))
     )
     assert finer < 0.6 * coarse
@@ -172,7 +172,13 @@ def test_a_late_clock_is_no_difference_between_meshes(recording):
     late = replace(late, grippers=moved)
     names, clock = ["youngs_modulus", "air.normal"], {"clock": 0.03}
     fit = identify(
-        twins.build_cloth_at(late), late, names, nuisances=clock, refine=True, model_errors=twins.SAME_SIMULATOR
+        twins.build_cloth_at(late),
+        late,
+        names,
+        nuisances=clock,
+        refine=True,
+        model_errors=twins.SAME_SIMULATOR,
+        exact_bench=True,
     )
     result = fit.parameters["air.normal"]
     assert result.value == pytest.approx(twins.TRUE_FABRIC.drag, abs=3 * result.std)
@@ -187,7 +193,7 @@ def _later(g, by):
 
 
 def test_a_correction_that_cannot_be_simulated_is_none(model, brief, monkeypatch):
-    plain = identify(model, brief, ["youngs_modulus"])
+    plain = identify(model, brief, ["youngs_modulus"], exact_bench=True)
     seen, longest = Objective.observe, collect_unknowns(model, ["youngs_modulus"], None)[0].max_step
 
     def torn_elsewhere(self, raw):
@@ -204,6 +210,6 @@ def test_a_correction_that_cannot_be_simulated_is_none(model, brief, monkeypatch
 
     ended = []
     monkeypatch.setattr(fit, "mesh_correction", step)
-    result = identify(model, brief, ["youngs_modulus"], refine=True)
+    result = identify(model, brief, ["youngs_modulus"], refine=True, exact_bench=True)
     assert result.parameters == plain.parameters
     assert any("not corrected for the coarseness of the mesh: on a finer one, the cloth" in w for w in result.warnings)

@@ -59,7 +59,7 @@ def test_points_may_have_been_rounded_on_disk(pair, recording, tmp_path):
 def test_contact_and_step_are_kept(brief, tmp_path):
     """As they were given: the simulation with other ones would be another."""
     cloth = build_cloth(brief, contact=Contact(0.05, damping=0.2, free_compression=0.1))
-    fit = identify(cloth, brief, ["youngs_modulus"], iterations=1, dt=1e-4)
+    fit = identify(cloth, brief, ["youngs_modulus"], iterations=1, dt=1e-4, exact_bench=True)
     again = replay_fit(fit.save(tmp_path), brief)
     assert again.cloth.contact == Contact(0.05, damping=0.2, free_compression=0.1)
     torch.testing.assert_close(again.frames, fit.frames_after[0], rtol=0, atol=1e-9)
@@ -87,7 +87,7 @@ def test_a_file_of_another_schema_is_refused(pair, recording, tmp_path, schema, 
 
 
 def test_the_right_one_of_several_episodes_is_found(recording, brief, tmp_path):
-    fit = identify(twins.build_cloth_at(brief), [brief, recording], ["youngs_modulus"], iterations=1)
+    fit = identify(twins.build_cloth_at(brief), [brief, recording], ["youngs_modulus"], iterations=1, exact_bench=True)
     fit.save(tmp_path)
     for number, one in enumerate((brief, recording)):
         again = replay_fit(tmp_path, one)
@@ -114,7 +114,7 @@ def test_what_no_episode_describes_is_not_left_out_silently(brief, tmp_path, key
     """A diagnosis has found a tilt or a wind, and the fabric is fitted anew beside it."""
     cloth = twins.build_cloth_at(brief)
     cloth.effects[key] = part(cloth)
-    identify(cloth, brief, ["youngs_modulus"], iterations=1).save(tmp_path)
+    identify(cloth, brief, ["youngs_modulus"], iterations=1, exact_bench=True).save(tmp_path)
     for read in (load_fitted_cloth, predict_episode, replay_fit):
         with pytest.raises(InvalidInput, match=f"a fit of another model; got {said} not alike in both"):
             read(tmp_path, brief)

@@ -34,7 +34,7 @@ def test_writes_what_it_found(folder, tmp_path, capsys):
 
 def test_takes_a_fit(scene, folder, tmp_path):
     short = twins.take_first_frames(scene.recording, 5)
-    fit = identify(twins.build_cloth_at(short), short, ["youngs_modulus"], iterations=2)
+    fit = identify(twins.build_cloth_at(short), short, ["youngs_modulus"], iterations=2, exact_bench=True)
     fit.save(tmp_path)
     other = twins.take_first_frames(scene.recording, 7)  # not the fitted episode
     cloth, uncertain = load_fitted_cloth(tmp_path, other)
