@@ -166,7 +166,7 @@ def _measure(make: Callable[[Scale], Problem], scale: Scale, name: str, method: 
     p, options = make(scale), METHOD_OPTIONS[method]
     count = p.iterations if options["method"] == "gauss-newton" else scale.descent
     started, cpu_started = time.perf_counter(), time.process_time()
-    fit = identify(p.cloth, p.recording, p.names, iterations=count, **options)
+    fit = identify(p.cloth, p.recording, p.names, iterations=count, exact_bench=True, **options)
     keys = ("simulations", "iterations", "converged", "chamfer_before", "chamfer_after")
     e = fit.parameters["youngs_modulus"]
     return {

@@ -129,7 +129,13 @@ def fit_stretch(name: str, pull: Pull, detail: Detail) -> dict[str, Any]:
     start = sheet_fabric(name)._replace(membrane=START_FACTOR * sheet_fabric(name).membrane, poisson=START_POISSON)
     model, began = stretching.build_sheet(recording, start), time.perf_counter()
     fit = identify(
-        model, recording, MEMBRANE_PARAMETERS, nuisances=CLAMP_NUISANCE, refine=True, model_errors=SAME_SIMULATOR
+        model,
+        recording,
+        MEMBRANE_PARAMETERS,
+        nuisances=CLAMP_NUISANCE,
+        refine=True,
+        model_errors=SAME_SIMULATOR,
+        exact_bench=True,
     )
     facts = {
         "direction": pull.direction,
@@ -163,6 +169,7 @@ def fit_contact_from_stretch(name: str, scale: Scale) -> dict[str, Any]:
         iterations=1,
         dt=dt,
         model_errors=SAME_SIMULATOR,
+        exact_bench=True,
     )
     return {"fabric": name, **extract_estimates(fit, names)}
 
@@ -187,6 +194,7 @@ def fit_press(name: str, index: int, scale: Scale, elsewhere: bool) -> dict[str,
         use=("force",),
         warm_start=True,
         model_errors=SAME_SIMULATOR,
+        exact_bench=True,
     )
     facts = {"offset": [float(x) for x in offset], "misfit": fit.fit["force_rms_after"]}
     return {

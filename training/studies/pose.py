@@ -174,7 +174,7 @@ def _identified(start: tc.Cloth, recording: Recording) -> tuple[tc.Cloth, Uncert
 
     Drag that was fitted to zero has no uncertainty.
     """
-    fit = tc.identify(start, recording, ["youngs_modulus", "air.normal"])
+    fit = tc.identify(start, recording, ["youngs_modulus", "air.normal"], exact_bench=True)
     stiff, drag = fit.parameters["youngs_modulus"], fit.parameters["air.normal"]
     uncertain = {
         "youngs_modulus": (stiff.value, min(1 + stiff.std / stiff.value, 2.0)),

@@ -118,7 +118,7 @@ def fit_fabric(scale: Scale, folder: Path) -> dict[str, Any]:
     """Fit the fabric to two motions."""
     torch.set_default_dtype(torch.float64)
     recordings = [_recorded(scale, name, k)[0] for k, name in enumerate(FIT_MOTIONS)]
-    fit = identify(build_cloth(recordings[0]), recordings, nuisances=["grasp"])
+    fit = identify(build_cloth(recordings[0]), recordings, nuisances=["grasp"], exact_bench=True)
     fit.save(folder)
     return {name: {"value": p.value, "std": p.std, "unit": p.unit} for name, p in fit.parameters.items()}
 

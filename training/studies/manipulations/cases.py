@@ -88,6 +88,7 @@ def solve_case(setup: Setup, what: Manipulation) -> dict[str, Any]:
             iterations=setup.iterations,
             warm_start=True,
             model_errors=SAME_SIMULATOR,
+            exact_bench=True,
         )
     except (SimulationDiverged, UnstableStep) as error:
         return case | {"failed": str(error)}
@@ -115,6 +116,7 @@ def solve_together(setup: Setup, manipulations: Sequence[Manipulation]) -> dict[
             iterations=setup.iterations,
             warm_start=True,
             model_errors=SAME_SIMULATOR,
+            exact_bench=True,
         )
     except (SimulationDiverged, UnstableStep) as error:
         return case | {"failed": str(error)}

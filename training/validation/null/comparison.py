@@ -99,6 +99,7 @@ def fit_base_model(folders: list[Path], nodes: int, start: FabricValues, on_prog
         on_progress=on_progress,
         iterations=6,
         warm_start=True,
+        exact_bench=True,
     )
 
 
