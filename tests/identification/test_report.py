@@ -197,7 +197,9 @@ def test_what_is_withdrawn_is_not_identified_by_its_prior_either(model):
 
 def test_nuisances_of_what_is_withdrawn_are_not_known_either():
     """Their tiny errors are those of slopes that mean nothing, as the parameters' are."""
-    episode, clock = SimpleNamespace(name="swing"), NuisanceSlice(None, slice(0, 1), ["clock"], ["s"], [0.02])
+    unbounded = [(-math.inf, math.inf)]
+    clock = NuisanceSlice(None, slice(0, 1), ["clock"], ["s"], [0.02], unbounded)
+    episode = SimpleNamespace(name="swing")
     raw, covariance = torch.tensor([0.012]), torch.tensor([[3e-4**2]])
     answer = make_nuisance_estimates([episode], [[clock]], raw, covariance)["swing"]["clock"]
     assert (answer.identifiable, answer.std) == (True, pytest.approx(3e-4))
