@@ -23,7 +23,7 @@ from ..independent.flex_sheet import SheetSpec, StillAir
 Array = np.ndarray
 EXAMPLE = Path(torchcloth.__file__).parent / "examples" / "bimanual_swing"
 PATH_STEP_S = 2.5e-3  # of the grippers' path, between whose knots a spline runs; the example's knots are 10 ms apart
-FITTED_VALUES = {  # of `torchcloth identify torchcloth/examples/bimanual_swing`
+FITTED_VALUES = {  # of `torchcloth demo`, which takes the bench as exact
     "material.youngs_modulus": 53.73e3,
     "material.poisson_ratio": 0.3485,
     "areal_density": 0.3496,
