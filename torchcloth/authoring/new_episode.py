@@ -9,7 +9,6 @@ from pathlib import Path
 
 import numpy as np
 
-from ..effects import Bending
 from ..episodes.recorded_cloth import DEFAULT_MEMBRANE_STIFFNESS_N_PER_M, DEFAULT_POISSON_RATIO, build_cloth
 from ..errors import InvalidInput
 from ..pose import PoseEstimator, estimate_first_shape
@@ -30,7 +29,9 @@ PICTURE_FILE = "new.png"  # in the episode's folder
 PICTURE_DPI = 110
 DEFAULT_GRIP_RADIUS_M = 0.012  # of pads of 24 mm
 GUESSED_AREAL_DENSITY_KG_PER_M2, GUESSED_AREAL_DENSITY_STD_KG_PER_M2 = 0.2, 0.1  # of a sheet that nobody weighed
-WEIGHED_STD_FRACTION = 0.02  # of a kitchen scale and a ruler
+START_BENDING_STIFFNESS_N_M = 5e-5  # stiffer than most: softer sheets ripple, and a search loses its way
+SCALE_STD_KG = 1e-3  # of a kitchen scale
+WEIGHED_STD_FRACTION = 0.02  # of a ruler, and of what hangs of a cut edge
 ROOM_AIR_DENSITY_KG_PER_M3 = 1.204  # at 20 degrees Celsius
 MOTION_MARGIN_S = 1.0  # of the joints before the first and after the last image
 MAX_SILENT_DURATION_S = 10.0  # a fit of a longer episode is slow, and light cloth is chaotic
@@ -134,7 +135,7 @@ def _describe_cloth(
         if not (np.isfinite(mass) and mass > 0):
             raise InvalidInput("mass", got=mass, expected="a number > 0 in kg")
         density = mass / (sheet[0] * sheet[1])
-        std = WEIGHED_STD_FRACTION * density
+        std = density * float(np.hypot(WEIGHED_STD_FRACTION, SCALE_STD_KG / mass))
     else:
         notes.append(
             f"areal density: {density:g} ± {std:g} kg/m^2, a guess; weigh the sheet and give --mass, as every "
@@ -142,14 +143,14 @@ def _describe_cloth(
         )
     if guessed_radius is not None:
         notes.append(f"grip: {1e3 * guessed_radius:.0f} mm around its place (else give --grip-radius)")
-    bending = Bending.amplitudes["stiffness"].typical
     nominal = {
         "membrane_stiffness": DEFAULT_MEMBRANE_STIFFNESS_N_PER_M,
         "poisson_ratio": DEFAULT_POISSON_RATIO,
-        "bending_stiffness": bending,
+        "bending_stiffness": START_BENDING_STIFFNESS_N_M,
     }
     notes.append(
-        f"start of a fit: membrane {DEFAULT_MEMBRANE_STIFFNESS_N_PER_M:g} N/m, bending {bending:g} N m, thickness "
+        f"start of a fit: membrane {DEFAULT_MEMBRANE_STIFFNESS_N_PER_M:g} N/m, bending "
+        f"{START_BENDING_STIFFNESS_N_M:g} N m, thickness "
         f"{1e3 * DEFAULT_THICKNESS_M:g} mm, air of {ROOM_AIR_DENSITY_KG_PER_M3:g} kg/m^3"
     )
     info = ClothInfo(

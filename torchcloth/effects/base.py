@@ -25,7 +25,7 @@ class Amplitude:
 
     Attributes:
         unit: SI unit.
-        typical: value in an ordinary case. The prior of a fit has twice it as standard deviation.
+        typical: value in an ordinary case.
         smallest: smallest effect of interest; None: 0.4 of the amplitude that a diagnosis calls typical.
         confounded_with: causes of the catalogue ("air.linear") or parameters ("Bending.stiffness") that data can
             hardly distinguish from this one.
@@ -35,6 +35,7 @@ class Amplitude:
         description: the cause in one sentence, for reports.
         diagnosis_typical: typical amplitude of the cause, from published magnitudes; None: ``typical``. It differs
             where the scale of the prior was chosen for other fabrics. Both decide results, so both are declared.
+        prior_ratio: standard deviation of the prior of a fit, over the typical value or the start, whichever is larger.
     """
 
     unit: str
@@ -46,6 +47,7 @@ class Amplitude:
     title: str = ""
     description: str = ""
     diagnosis_typical: float | None = None
+    prior_ratio: float = 2.0
 
     @property
     def typical_of_cause(self) -> float:

@@ -18,7 +18,7 @@ from torch import Tensor
 
 from ..boundaries import Grasp
 from ..cloth import Cloth
-from ..errors import InvalidInput
+from ..errors import InvalidInput, SimulationDiverged
 from ..meshes import Mesh
 from ..meshes.mesh import signed_area
 from ..meshes.patches import Patch, project_along_rim
@@ -27,6 +27,7 @@ from .pattern_interpolation import interpolate_on_pattern, interpolation_weights
 from .replay import Frames
 from .world import World, rebuild_cloth
 
+MAX_REMEMBERED_CLOTHS = 8  # that are gripped otherwise
 TAPER_RADII = 1.0  # distance over which the pattern around a patch gives way, in radii; farther out meshes differ more
 TRIED_EXTENTS = tuple(0.1 * k for k in range(7, 0, -1))  # changes of a patch's radius, in radii
 MIN_TRIANGLE_AREA_RATIO = 0.1  # of a stretched triangle to the original one
@@ -102,6 +103,39 @@ def grip_extent_range(cloth: Cloth) -> tuple[float, float]:
                 ends[k] = sign * fraction
                 break
     return ends[0], ends[1]
+
+
+class GrippedCloths:
+    """A cloth whose grippers hold more or less than stated; the last few are remembered.
+
+    Args:
+        cloth: as stated.
+    """
+
+    def __init__(self, cloth: Cloth) -> None:
+        self.cloth = cloth
+        self._recent: dict[tuple[tuple[str, float], ...], StretchedCloth] = {}
+
+    def grip(self, wider: Mapping[str, float]) -> tuple[Cloth, StretchedCloth | None]:
+        """Return the cloth, and the stretched one that it is part of; None where it is gripped as stated.
+
+        Args:
+            wider: distance by which each patch's edge lies farther out [m], by gripper.
+
+        Raises:
+            SimulationDiverged: the pattern has no room for such grips.
+        """
+        if not any(wider.values()):
+            return self.cloth, None
+        key = tuple(wider.items())
+        if key not in self._recent:
+            try:
+                self._recent[key] = stretch_around_grips(self.cloth, wider)
+            except InvalidInput as error:
+                raise SimulationDiverged(f"the cloth in its grips: {error}") from None
+            while len(self._recent) > MAX_REMEMBERED_CLOTHS:
+                del self._recent[next(iter(self._recent))]
+        return self._recent[key].cloth, self._recent[key]
 
 
 def move_grip_patches(world: World, wider: float = 0.0, along: float = 0.0) -> World:

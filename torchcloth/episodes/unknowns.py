@@ -77,9 +77,10 @@ class Unknown:
     def max_step(self) -> float:
         """Longest step of one iteration.
 
-        A factor of 2.7 of a log parameter; of an amplitude half its typical size or half its start, whichever is more.
+        A factor of 2.7 of a log parameter; of an amplitude a quarter of the prior's standard deviation, or half its
+        typical size if that is more.
         """
-        return 0.5 * max(self.typical_amplitude, abs(self.start)) if self.typical_amplitude else 1.0
+        return max(0.25 * self.prior_std, 0.5 * self.typical_amplitude) if self.typical_amplitude else 1.0
 
     @property
     def typical_change(self) -> float:
@@ -181,7 +182,7 @@ def _make_unknown(cloth: Cloth, name: str, path: str) -> Unknown:
         # a part that declares no amplitude: its start says how large it is
         undeclared = TYPICAL_AMPLITUDES.get(attribute, max(1.0, abs(start)))
         typical = undeclared if amplitude is None else amplitude.typical
-        std = 2.0 * max(typical, abs(start))
+        std = (2.0 if amplitude is None else amplitude.prior_ratio) * max(typical, abs(start))
     return Unknown(name, f"{path}.raw", parameter, start, std, typical)
 
 

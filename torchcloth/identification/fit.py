@@ -331,6 +331,8 @@ def _assemble_result(
     fit["withdrawn"] = is_withdrawn
     if is_withdrawn:  # slopes of chaos, or far from the optimum, promise tiny errors
         estimates = withdraw_estimates(estimates, full.unknowns, final.raw)
+    elif checked.unusable_parameters:
+        estimates = withdraw_estimates(estimates, full.unknowns, final.raw, checked.unusable_parameters)
     warnings += [reason for reason in (misfit_reason, outcome.unfinished_reason) if reason]
     warnings += warn_of_skew(estimates, [name for name in checked.curved_parameters if name not in profiles])
     used_frames = [x[: len(e.times)] for x, e in zip(after, used.episodes, strict=True)]

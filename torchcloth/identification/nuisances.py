@@ -25,7 +25,14 @@ CAMERA_TURN_LEVER_M = 0.1  # distance at which a turned camera is off by as much
 GRASP_TURN_REACH = 0.25  # of the cloth's extent, over which the fabric around a grip turns along
 AXIS_NAMES = "xyz"
 GRIP_EXTENT_STD_RADII = 0.4  # of the patch that a gripper holds, in radii of the stated one
-BENCH_CAMERA_STDS: dict[str, float | None] = {"clock": 0.03, "jitter": None, "camera": 0.004}  # s, s, m
+# s, s, m, m, m
+BENCH_CAMERA_STDS: dict[str, float | None] = {
+    "clock": 0.03,
+    "jitter": None,
+    "camera": 0.004,
+    "rim": 0.005,
+    "rim_scatter": None,
+}
 BENCH_CLOTH_STDS: dict[str, float | None] = {"grasp": None, "grip": None, "shape": 0.004}  # m
 MAX_CLOCK_OFFSET_STDS = 2.0  # for which a simulation goes on after the last frame
 
@@ -40,11 +47,13 @@ class AbstractNuisance(ABC):
         name: public name.
         unit: of its numbers.
         std: standard deviation of the prior, in ``unit``.
+        acts_on_cloth: whether the cloth moves otherwise, so that slopes need simulations; else it is seen otherwise.
     """
 
     name: str
     unit: str
     std: float
+    acts_on_cloth = False
 
     def __init__(self, std: float | None = None) -> None:
         self.std = type(self).std if std is None else std
@@ -111,7 +120,7 @@ class StampJitter(AbstractNuisance):
         self.is_estimated = std is None
 
     def number_names(self, cloth: Cloth, episode: Episode) -> list[str]:
-        """Return no names."""
+        """Return nothing, because the times of the frames are marginalised."""
         return []
 
 
@@ -175,8 +184,23 @@ class RimOffset(AbstractNuisance):
         return frames._replace(rim_offset=frames.rim_offset + values[0])
 
 
+class RimScatter(AbstractNuisance):
+    """Offset of each piece of the cloud's rim, on top of what all share: segmentation cuts sides differently.
+
+    It lasts for the episode and is marginalised (``estimators.rim_scatter``); it has no numbers in the search.
+    """
+
+    name, unit, std = "rim_scatter", "m", 0.002
+
+    def number_names(self, cloth: Cloth, episode: Episode) -> list[str]:
+        """Return nothing, because the offsets of the pieces are marginalised."""
+        return []
+
+
 class AbstractGraspNuisance(AbstractNuisance):
     """Three numbers for each gripper."""
+
+    acts_on_cloth = True
 
     def number_names(self, cloth: Cloth, episode: Episode) -> list[str]:
         """Return names of three axes for each gripper."""
@@ -227,6 +251,7 @@ class GripExtent(AbstractNuisance):
     """
 
     name, unit, std = "grip", "m", math.nan
+    acts_on_cloth = True
 
     def number_names(self, cloth: Cloth, episode: Episode) -> list[str]:
         """Return the grippers whose patch has a place on the pattern."""
@@ -250,6 +275,8 @@ class FirstStateOffset(AbstractNuisance):
         std: of the prior of each number; None: the default.
         fields: [M, V], the coarsest first; None: a constant one and two linear ones, along the principal axes at rest.
     """
+
+    acts_on_cloth = True
 
     def __init__(self, std: float | None = None, fields: Tensor | None = None) -> None:
         super().__init__(std)
@@ -313,6 +340,7 @@ NUISANCE_KINDS: dict[str, type[AbstractNuisance]] = {
         CameraOffset,
         ForceTare,
         RimOffset,
+        RimScatter,
         GraspOffset,
         GraspTurn,
         GripExtent,

@@ -8,6 +8,7 @@ errors computed from them are far too small.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 from . import levenberg_marquardt
@@ -56,7 +57,9 @@ def find_failure_reason(
         return f"the residual is {ratio:.1f} times the sensor noise"
     if checked.covariance is not None:  # the slopes do not cover all data that were used
         return "" if checked.final.converged else "simulations around it lead farther"
-    remaining = remaining_std_errors(objective.problem(), checked.final, criteria)
+    names = [u.name for u in objective.unknowns]
+    ignored = [names.index(name) for name in checked.unusable_parameters]
+    remaining = remaining_std_errors(objective.problem(), checked.final, criteria, ignored)
     is_far = remaining > criteria.max_remaining_std_errors
     return f"its slopes lead {remaining:.0f} standard errors farther" if is_far else ""
 
@@ -65,10 +68,11 @@ def remaining_std_errors(
     problem: levenberg_marquardt.Problem,
     at: levenberg_marquardt.Iterate,
     criteria: ConvergenceCriteria = CONVERGENCE_CRITERIA,
+    ignored: Sequence[int] = (),
 ) -> float:
     """Return how far the minimum is that the slopes predict, in standard errors of the reported unknowns."""
     gradient, hessian = levenberg_marquardt.normal_equations(problem, at)
     reach = criteria.max_prior_stds * problem.prior_std
     low, high = (problem.clip(at.raw + sign * reach) - at.raw for sign in (-1, 1))
     step = solve_box_qp(hessian, -gradient, low, high)
-    return levenberg_marquardt.step_in_std_errors(problem, hessian, step)
+    return levenberg_marquardt.step_in_std_errors(problem, hessian, step, ignored)

@@ -44,13 +44,13 @@ class FrameTimeSettings:
     max_iterations: int = 4
     max_shift_stds: float = 3.0
     wide_std_s: float = 0.06
-    min_std_s: float = 1e-3
+    min_std_s: float = 2e-3
     min_excess_stds: float = 3.0
     min_differences: int = 8
 
 
 FRAME_TIME_SETTINGS = FrameTimeSettings()
-BISECTIONS = 30  # of the stamps' standard deviation
+BISECTION_COUNT = 30  # of the stamps' standard deviation
 CAMERA_BLOCKS = ("points", "edges", "markers")
 
 
@@ -227,7 +227,7 @@ def estimate_stamp_std(times: FrameTimes, frames: Sequence[Frames], scenes: Sequ
     if count < settings.min_differences or excess(0.0) < settings.min_excess_stds * (4 * count) ** 0.5:
         return 0.0
     low, high = 0.0, wide.std
-    for _ in range(BISECTIONS):
+    for _ in range(BISECTION_COUNT):
         middle = 0.5 * (low + high)
         low, high = (middle, high) if excess(middle) > 0 else (low, middle)
     return high if high > settings.min_std_s else 0.0

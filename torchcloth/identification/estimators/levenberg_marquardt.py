@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -373,13 +373,14 @@ def _is_small_step(problem: Problem, at: Iterate, step: Tensor, tolerance: float
     return step_in_std_errors(problem, information_matrix(problem, at), step) < tolerance
 
 
-def step_in_std_errors(problem: Problem, information: Tensor, step: Tensor) -> float:
-    """Return how long a step [K] of the reported unknowns is, by their marginal information."""
+def step_in_std_errors(problem: Problem, information: Tensor, step: Tensor, ignored: Sequence[int] = ()) -> float:
+    """Return how long a step [K] of the reported unknowns is, by their marginal information, without ``ignored``."""
     count = len(step) if problem.reported is None else problem.reported
-    here, others = step[:count], information[count:, count:]
-    coupling = information[count:, :count]
-    marginal = information[:count, :count] - coupling.mT @ torch.linalg.solve(others, coupling)
-    return max(0.0, float(here @ marginal @ here)) ** 0.5
+    counts = torch.tensor([k < count and k not in ignored for k in range(len(step))])
+    coupling = information[~counts][:, counts]
+    marginal = information[counts][:, counts]
+    marginal = marginal - coupling.mT @ torch.linalg.solve(information[~counts][:, ~counts], coupling)
+    return max(0.0, float(step[counts] @ marginal @ step[counts])) ** 0.5
 
 
 def _is_near_minimum(problem: Problem, at: Iterate, tolerance: float) -> bool:

@@ -62,6 +62,8 @@ class LinearityCheck(NamedTuple):
         failure_reason: why tangents are of no use here. Empty where they are.
         covariance: [K, K] of the estimate, where it does not follow from the tangents.
         failed_tangents: the tangents that failed. None where they hold.
+        unusable_parameters: names of unknowns whose tangents fail where those of others hold: these do not count as
+            identified.
     """
 
     final: levenberg_marquardt.Iterate
@@ -71,6 +73,7 @@ class LinearityCheck(NamedTuple):
     failure_reason: str = ""
     covariance: Tensor | None = None
     failed_tangents: FailedTangents | None = None
+    unusable_parameters: tuple[str, ...] = ()
 
     @property
     def is_withdrawn(self) -> bool:
@@ -83,7 +86,9 @@ def check_linearity(
 ) -> LinearityCheck:
     """Compare the tangents with finite steps of about a standard error, and replace those that fail by differences.
 
-    Tangents are exact. Where the motion is unstable they describe a neighbourhood that is too small to matter.
+    Tangents are exact. Where the motion is unstable they describe a neighbourhood that is too small to matter. A
+    parameter that moves the cloth less than ripples do may fail alone: its error is unknown, and that of others uses
+    its finite slope.
     """
     prior = objective.problem().prior_std
     deviation = torch.zeros_like(prior)
@@ -102,11 +107,18 @@ def check_linearity(
         pairs = zip(objective.unknowns, over_one_std, strict=True)
         curved = [u.name for u, skew in pairs if skew >= criteria.min_skew_error]
         return LinearityCheck(final, influence, [], curved)
-    pairs = zip(objective.unknowns, error, strict=True)
-    names = ", ".join(u.name for u, e in pairs if e >= criteria.max_relative_error)
+    pairs = list(zip(objective.unknowns, error, strict=True))
+    failing = [u.name for u, e in pairs if e >= criteria.max_relative_error]
+    names, largest = ", ".join(failing), min(1000.0, 100 * float(error.max()))
+    is_runaway = has_runaway_tangents(objective, final, criteria)
+    if not is_runaway and any(u.name not in failing for u in objective.unknowns if not u.measured):
+        warning = f"tangents of {names} differ from finite steps by up to {largest:.0f} %: no estimate of {names}"
+        return LinearityCheck(
+            final._replace(linear=secants), influence, [warning], [], unusable_parameters=tuple(failing)
+        )
     reason = (
         f"the motion is unstable or strongly nonlinear at the solution (tangents of {names} differ from finite steps "
-        f"by up to {min(1000.0, 100 * float(error.max())):.0f} %)"
+        f"by up to {largest:.0f} %)"
     )
     warning = f"{reason}: no parameter counts as identified"
     tangents = FailedTangents(final.linear.jacobian[:, : len(steps)], steps)

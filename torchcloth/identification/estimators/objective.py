@@ -14,14 +14,14 @@ from torch import Tensor
 from ..._utils.resume import ResumableStore, digest
 from ...cloth import Cloth
 from ...episodes.cloth_fingerprint import cloth_fingerprint_parts
-from ...episodes.grip_patch_mesh import StretchedCloth, stretch_around_grips
+from ...episodes.grip_patch_mesh import GrippedCloths, StretchedCloth
 from ...episodes.observed import Episode
 from ...episodes.observed_surface import build_surface
 from ...episodes.replay import Frames, StateModes, map_frames, see_at, simulate, simulate_with_tangents
 from ...episodes.unknowns import Unknown
 from ...errors import InvalidInput, SimulationDiverged, UnstableStep
 from ...parameters import PhysicalParameter
-from ..nuisances import AbstractNuisance, GripExtent, NuisanceSlice, add_lookahead, place_nuisances
+from ..nuisances import AbstractNuisance, GripExtent, NuisanceSlice, RimScatter, add_lookahead, place_nuisances
 from ..residuals.blocks import BLOCKS_BY_DATA_KIND, RESIDUAL_BLOCKS, Block, check_noise_floors
 from ..residuals.metrics import DistanceMetrics, distance_metrics, force_rms, huber
 from ..residuals.rows import ResidualRows, match_points
@@ -29,8 +29,8 @@ from ..uncertainty.identifiability import ParameterInfluence
 from . import levenberg_marquardt
 from .frame_times import FrameTimes, RowNoise, Scene, estimate_stamp_std
 from .levenberg_marquardt import DEFAULT_NOISE_MODEL, NoiseModelSettings
+from .rim_scatter import marginalise_piece_offsets
 
-MAX_REMEMBERED_CLOTHS = 8  # that are gripped otherwise
 GRIP_EXTENT_STEP_STDS = 0.15  # of a finite slope by how far out a gripper holds the cloth
 MAX_REMEMBERED_POINTS = 4  # whose simulated frames are kept in memory
 
@@ -93,7 +93,7 @@ class Objective:
         self.frame_times: FrameTimes | None = None
         self.simulations = 0
         self._counted_points: set[tuple[float, ...]] = set()
-        self._stretched_cloths: dict[tuple[tuple[str, float], ...], StretchedCloth] = {}
+        self._gripped_cloths = GrippedCloths(cloth)
         self._recent_frames: dict[tuple[float, ...], list[Frames]] = {}
         self._last_linearised: tuple[tuple[float, ...], list[tuple[Frames, Frames]]] | None = None
 
@@ -191,6 +191,17 @@ class Objective:
             out[index[name]] = PhysicalParameter(value, parameter.unit, parameter.domain, name=name).raw.detach()
         return out
 
+    def take_unknowns(self, raw: Tensor, other: Objective) -> Tensor:
+        """Return the start [K] with the values [K'] that a point of an objective with other nuisances has."""
+        out = self.start.clone()
+        out[: len(self.unknowns)] = raw[: len(self.unknowns)]
+        for slices, other_slices in zip(self.nuisance_slices, other.nuisance_slices, strict=True):
+            indices = {s.nuisance.name: s.index for s in other_slices}
+            for s in slices:
+                if s.nuisance.name in indices:
+                    out[s.index] = raw[indices[s.nuisance.name]]
+        return out
+
     def to_scaled(self, raw: Tensor) -> Tensor:
         """Convert unknowns [K] to standard deviations from the priors' means."""
         return (raw - self.prior_mean) / self.prior_std
@@ -265,15 +276,7 @@ class Objective:
 
     def _gripped_cloth(self, raw: Tensor, i: int) -> tuple[Cloth, StretchedCloth | None]:
         """Return the cloth as it is gripped in episode ``i``, and where the pattern is stretched for that."""
-        wider = self._grip_extents(raw, i)
-        if not any(wider.values()):
-            return self.cloth, None
-        key = tuple(wider.items())
-        if key not in self._stretched_cloths:
-            self._stretched_cloths[key] = stretch_around_grips(self.cloth, wider)
-            while len(self._stretched_cloths) > MAX_REMEMBERED_CLOTHS:
-                del self._stretched_cloths[next(iter(self._stretched_cloths))]
-        return self._stretched_cloths[key].cloth, self._stretched_cloths[key]
+        return self._gripped_cloths.grip(self._grip_extents(raw, i))
 
     def _grip_extents(self, raw: Tensor, i: int) -> dict[str, float]:
         """Return by how much farther out each gripper holds the cloth in episode ``i`` [m]."""
@@ -370,16 +373,23 @@ class Objective:
             if not isinstance(s.nuisance, GripExtent):
                 continue
             for k, std in zip(range(s.index.start, s.index.stop), s.stds, strict=True):
-                shifted = raw.detach().clone()
-                shifted[k] += GRIP_EXTENT_STEP_STDS * std
-                if not torch.equal(self.clip(shifted), shifted):
-                    shifted[k] -= 2 * GRIP_EXTENT_STEP_STDS * std
-                step = float(shifted[k] - raw[k])
-                with torch.no_grad():
-                    there = self._simulate_cloth(shifted, i)
+                step, there = self._simulate_with_other_grip(raw, i, k, GRIP_EXTENT_STEP_STDS * std)
+                if there is None:
+                    continue
                 derivatives.x[k], derivatives.v[k] = (there.x - frames.x) / step, (there.v - frames.v) / step
                 for name, wrench in derivatives.wrench.items():
                     wrench[k] = (there.wrench[name] - frames.wrench[name]) / step
+
+    @torch.no_grad()
+    def _simulate_with_other_grip(self, raw: Tensor, i: int, k: int, size: float) -> tuple[float, Frames | None]:
+        """(step of unknown ``k``, frames there), backwards where forwards fails; (0, None) where both fail."""
+        for step in (size, -size):
+            shifted = raw.detach().clone()
+            shifted[k] += step
+            if torch.equal(self.clip(shifted), shifted):
+                with suppress(SimulationDiverged, UnstableStep):
+                    return step, self._simulate_cloth(shifted, i)
+        return 0.0, None
 
     # -- residuals ------------------------------------------------------------------------------------------------
 
@@ -540,8 +550,11 @@ class Objective:
                 rows_by_block = {block.name: block.rows(simulated_episode) for block in self.blocks}
             else:
                 rows_by_block = self.frame_times.project(frames, derivatives, self.scene(i), followed_by)
+            scatter = next((n for n in self.nuisances if isinstance(n, RimScatter)), None)
             for b, block in enumerate(self.blocks):
                 rows = rows_by_block[block.name]
+                if rows is not None and block.name == "edges" and scatter is not None:
+                    rows = marginalise_piece_offsets(rows, scatter.std)
                 if rows is not None:
                     parts.append((b, first_frame, self._frames_per_reference_period(episode.times), rows))
             first_frame += len(episode.times) + self.noise_model.frames_per_time_block

@@ -109,9 +109,9 @@ class Search:
             starts = self._search_from_several(start, count, iterations)
             start = starts.raw
         elif early and method == "gauss-newton":
-            part = full.first_fraction(EARLY_FRAME_FRACTION)
-            start = self._fit_early_frames(part, start, iterations).raw if part.has_data else start
-            self.partial_simulations += part.simulations
+            start = self._fit_roughly(full.first_fraction(EARLY_FRAME_FRACTION), start, iterations)
+            if any(nuisance.acts_on_cloth for nuisance in full.nuisances):
+                start = self._fit_roughly(full, start, iterations)
         final = self._fit_all_frames(method, start, iterations, rate)
         for _ in range(MAX_STAMP_ROUNDS):
             if not self._estimate_stamps(final.raw):
@@ -231,6 +231,16 @@ class Search:
             chamfer = self.objective.distance_metrics(at.raw).chamfer
             self.on_progress(len(self.history) - 1, chamfer, self.objective.physical_values(at.raw), 1.0)
         return False
+
+    def _fit_roughly(self, part: Objective, start: Tensor, iterations: int) -> Tensor:
+        """Fit frames as far as is cheap: without nuisances that act on the cloth, whose slopes need simulations."""
+        rough = part.with_nuisances([n for n in part.nuisances if not n.acts_on_cloth])
+        if not rough.has_data:
+            return start
+        full, begin = self.objective, rough.take_unknowns(start, self.objective)
+        end = self._fit_early_frames(rough, begin, iterations).raw
+        self.partial_simulations += rough.simulations
+        return full.take_unknowns(end, rough)
 
     def _fit_early_frames(self, part: Objective, start: Tensor, iterations: int) -> levenberg_marquardt.Iterate:
         """Fit early frames, in which a wrong start has not yet led the cloth elsewhere."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -192,7 +192,9 @@ def make_nuisance_estimates(
     return out
 
 
-def withdraw_estimates(estimates: EstimateSet, unknowns: Sequence[Unknown], raw: Tensor) -> EstimateSet:
+def withdraw_estimates(
+    estimates: EstimateSet, unknowns: Sequence[Unknown], raw: Tensor, names: Collection[str] | None = None
+) -> EstimateSet:
     """Return the estimates with none identified and the priors' errors: the model does not describe the data.
 
     A parameter that was measured beforehand is withdrawn too, because the fit's value is not the measured one.
@@ -203,19 +205,25 @@ def withdraw_estimates(estimates: EstimateSet, unknowns: Sequence[Unknown], raw:
         estimates: of the fit.
         unknowns: the fitted parameters.
         raw: [K] where the fit ended.
+        names: those that are withdrawn; None: all.
     """
+    withdrawn = set(estimates.parameters if names is None else names)
+    if names is not None and "youngs_modulus" in withdrawn:
+        withdrawn.add("membrane_stiffness")
     prior = {u.name: _prior_estimate(u, "data") for u in unknowns}
     ends = zip(unknowns, raw.tolist(), strict=False)
     stds = {u.name: u.slope(r) * math.hypot(u.prior_std, r - u.prior_mean) for u, r in ends}
     parameters = dict(estimates.parameters)
     for name, e in estimates.parameters.items():
+        if name not in withdrawn:
+            continue
         if name in prior:
             p = prior[name]
             interval = (min(p.ci95[0], e.value), max(p.ci95[1], e.value))
             parameters[name] = replace(e, std=stds[name], ci95=interval, identifiable=False)
         else:
             parameters[name] = replace(e, identifiable=False)
-    if "membrane_stiffness" in parameters and "youngs_modulus" in parameters:
+    if {"membrane_stiffness", "youngs_modulus"} <= withdrawn & set(parameters):
         thickness = estimates.parameters["membrane_stiffness"].value / estimates.parameters["youngs_modulus"].value
         parameters["membrane_stiffness"] = _scale_estimate(parameters["youngs_modulus"], thickness, "N/m")
     return estimates._replace(parameters=parameters)
