@@ -12,19 +12,20 @@ TOOL_QUAT_XYZW = np.array([0.5, 0.5, 0.0, 0.0]) * 2**0.5  # points down, as the 
 def make_run(seed=0, size=8, duration=9.0, noise_m=1e-3):
     """Return a run whose cloth hangs straight below its edge, and the true times of its frames; the first has none.
 
-    The tool stands for a second, moves at up to 0.4 m/s for six seconds, and stands again.
+    The tool stands for a second, moves at up to 0.8 m/s until two seconds before the end, and stands again.
     """
     draw = np.random.default_rng(seed)
     t_tool = np.arange(0, duration, 0.05)
 
-    def height(t):
-        return np.clip((np.clip(t, 1, 7) - 1) / 6, 0, 1)
+    moving = duration - 3
+    cycles = moving / 3
 
     def tool(t):
-        s = height(t)
+        s = np.clip((t - 1) / moving, 0, 1)
         blend = s**2 * (3 - 2 * s)
         return np.stack(
-            [0.02 * blend, -0.4 + 0.2 * np.sin(4 * np.pi * blend), 0.35 + 0.05 * np.sin(2 * np.pi * blend)], axis=-1
+            [0.02 * blend, -0.4 + 0.2 * np.sin(2 * np.pi * cycles * blend), 0.35 + 0.05 * np.sin(2 * np.pi * blend)],
+            axis=-1,
         )
 
     stamps = np.cumsum(np.clip(0.1 + 0.03 * draw.normal(size=int((duration - 0.3) / 0.1)), 0.05, None))

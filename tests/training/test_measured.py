@@ -19,7 +19,7 @@ from torchcloth.training.validation.realdata import free_swing
 @pytest.mark.slow
 @pytest.mark.realdata
 def test_fast_study(realdata, tmp_path):
-    """About a minute on one core: every source has its table and its numbers, and a second run computes nothing."""
+    """Three minutes on one core: every source has its table and its numbers, and a second run computes nothing."""
     out = tmp_path / "out"
     command = [sys.executable, "-m", "torchcloth.training.studies", "measured", "--fast", "--out", str(out)]
     environment = {**os.environ, "OMP_NUM_THREADS": "1", "COLUMNS": "160", "TORCHCLOTH_REALDATA": str(realdata)}
@@ -30,8 +30,8 @@ def test_fast_study(realdata, tmp_path):
     assert "about 0.0 min left" in first.stdout
     assert "min left" not in again.stdout, "nothing is computed twice"
     result = json.loads((out / "measured.json").read_text())
-    names = dict(zip(("nylon", "knits", "swings", "sample"), SOURCE_NAMES, strict=True))
-    assert set(result) - {"schema"} == {name for name, folder in names.items() if (realdata / folder).is_dir()}
+    names = dict(zip(("nylon", "knits", "swings", "sample", "carries"), SOURCE_NAMES, strict=True))
+    assert set(result) - {"schema", "timed"} == {name for name, folder in names.items() if (realdata / folder).is_dir()}
     if "nylon" in result:
         _check_nylon(result["nylon"], first.stdout, out)
     if "knits" in result:
@@ -44,6 +44,15 @@ def test_fast_study(realdata, tmp_path):
         assert predicted["whole"]["rms"] < predicted["null"]["rms"]
         assert 1.0 < predicted["vacuum"]["frequency"] < 1.2
         assert "Only ratios to the areal density are identifiable" in first.stdout
+        entrained, plain = (result["timed"]["models"][label]["fitted"] for label in ("entrained", "no memory"))
+        assert entrained["all"] < plain["all"]
+        assert entrained["lower"] < 0.7 * plain["lower"]
+        assert (out / "timed.png").is_file()
+    if "carries" in result:
+        carried = result["carries"]["models"]["entrained"]["still"]
+        assert carried["all"] < 0.010
+        assert carried["lower"] < 0.015
+        assert "Carries predicted with the fits to the swings" in first.stdout
     if "sample" in result:
         assert "vertices to cloud" in first.stdout
         distances = result["sample"]["distances"]

@@ -1,8 +1,8 @@
 """Measured cloth: fits to some measurements predict the others, each compared with its null and its interval.
 
 The study predicts nylon at angles that were not fitted, the third pull of knits from the first two, 10 swings in air
-from 20 others, and the sample that the paper's authors released. The data are not shipped: name their folder by
---source.
+from 20 others, carries of the same cloth from the swings, and the sample that the paper's authors released. The data
+are not shipped: name their folder by --source.
 """
 
 from __future__ import annotations
@@ -17,10 +17,28 @@ from torchcloth._utils.resume import clear_store
 from torchcloth.errors import InvalidInput
 
 from ...resumable import ResumableStudy, write_result
-from . import free_swings, measured_figures, measured_tables, sample, swing_predictions, swings, tension
+from ...validation.realdata import carries
+from . import (
+    free_swings,
+    measured_figures,
+    measured_tables,
+    rig,
+    sample,
+    swing_predictions,
+    swings,
+    tension,
+    timed,
+    timed_report,
+)
 
 DATA_VARIABLE = "TORCHCLOTH_REALDATA"
-SOURCE_NAMES = (tension.NYLON_SOURCE, tension.KNIT_SOURCE, swings.SOURCE_NAME, sample.SOURCE_NAME)
+SOURCE_NAMES = (
+    tension.NYLON_SOURCE,
+    tension.KNIT_SOURCE,
+    swings.SOURCE_NAME,
+    sample.SOURCE_NAME,
+    carries.SOURCE_NAME,
+)
 
 
 def add(parser: argparse.ArgumentParser) -> None:
@@ -40,6 +58,7 @@ def run(options: argparse.Namespace) -> None:
         result["knits"] = _knits(study, source / tension.KNIT_SOURCE, options)
     if swings.SOURCE_NAME in available:
         result["swings"] = _swings(study, source / swings.SOURCE_NAME, options)
+        result |= _timed(study, source, options)
     if sample.SOURCE_NAME in available:
         result["sample"] = _sample(study, source / sample.SOURCE_NAME, options)
     for name in set(SOURCE_NAMES) - set(available):
@@ -104,6 +123,32 @@ def _swings(study: ResumableStudy, source: Path, options: argparse.Namespace) ->
     measured_tables.swings(result)
     measured_figures.swings(result, runs, options.out / "swings.png")
     return result
+
+
+def _timed(study: ResumableStudy, source: Path, options: argparse.Namespace) -> dict[str, Any]:
+    """Fit swings with the times of single frames, and predict other swings and the carries."""
+    folder, carry_folder = source / swings.SOURCE_NAME, source / carries.SOURCE_NAME
+    fitted, predicted = swings.split(folder, options.fast)
+    rounds = timed.FAST_ROUNDS if options.fast else timed.FIT_ROUNDS
+    cases = {
+        f"timed-fit-{label.replace(' ', '-')}": partial(_timed_fit, folder, fitted, start, rounds)
+        for label, start in timed.TIMED_STARTS.items()
+    }
+    fits = dict(zip(timed.TIMED_STARTS, study.run(cases).values(), strict=True))
+    [swing_case] = study.run({"timed-swings": partial(timed.predict_swings, folder, predicted, fits)}).values()
+    result = {"timed": {"fits": fits, "fitted_runs": fitted, "predicted_runs": predicted, **swing_case}}
+    if carry_folder.is_dir():
+        names = sorted(carries.read_runs(carry_folder))[4:5] if options.fast else None
+        [result["carries"]] = study.run(
+            {"timed-carries": partial(timed.predict_carries, carry_folder, fits, names)}
+        ).values()
+    timed_report.print_tables(result)
+    timed_report.draw(result, options.out / "timed.png")
+    return result
+
+
+def _timed_fit(folder: Path, names: list[str], start: rig.Values, rounds: int) -> dict[str, Any]:
+    return timed.fit(timed.read_swings(folder, names), start, rounds)
 
 
 def _fit(source: Path, names: list[str], out: Path, fast: bool) -> dict[str, Any]:

@@ -29,7 +29,7 @@ def load_band(prediction: dict[str, Any]) -> PredictionBand:
 
 def nylon(result: dict[str, Any], source: Path, path: Path) -> Path:
     """Draw each angle as predicted from the other three."""
-    figure, axes = _figure(1, len(result["left_out"]), (15, 4))
+    figure, axes = make_figure(1, len(result["left_out"]), (15, 4))
     tables = nylon_adapter.read_tables(source)
     for axis, (angle, prediction) in zip(axes[0], result["left_out"].items(), strict=True):
         table = tables[int(angle)]
@@ -48,7 +48,7 @@ def nylon(result: dict[str, Any], source: Path, path: Path) -> Path:
 
 def knits(result: dict[str, Any], source: Path, path: Path) -> Path:
     """Draw force and lateral strain of the third pull."""
-    figure, axes = _figure(2, len(result), (3.4 * len(result) + 0.6, 6.5))
+    figure, axes = make_figure(2, len(result), (3.4 * len(result) + 0.6, 6.5))
     fabrics = knit_adapter.read_fabrics(source)
     for column, (name, fabric) in zip(axes.T, result.items(), strict=True):
         for colour, (one, whole) in zip(
@@ -74,7 +74,7 @@ def knits(result: dict[str, Any], source: Path, path: Path) -> Path:
 
 def swings(result: dict[str, Any], runs: dict[str, dict[str, Any]], path: Path) -> Path:
     """Draw the lower edge of one predicted run, and frequency and decay of all models."""
-    figure, axes = _figure(1, 3, (15, 4.2))
+    figure, axes = make_figure(1, 3, (15, 4.2))
     name, run = next(reversed(runs.items()))
     t, seen = np.array(run["t"]), np.array([np.nan if y is None else y for y in run["lower_edge"]])
     for model in ("vacuum", "whole", "free"):
@@ -103,7 +103,8 @@ def swings(result: dict[str, Any], runs: dict[str, dict[str, Any]], path: Path) 
     return save_figure(figure, path)
 
 
-def _figure(rows: int, columns: int, size: tuple[float, float]) -> tuple[Any, np.ndarray]:
+def make_figure(rows: int, columns: int, size: tuple[float, float]) -> tuple[Any, np.ndarray]:
+    """Make a figure with a grid of axes."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=size, layout="constrained")

@@ -25,8 +25,8 @@ MODEL_LABELS = {
 
 def nylon(result: dict[str, Any], folder: Path) -> None:
     """Print fits of four angles, predictions of each from the other three, and angles between."""
-    console = _console()
-    table = _table("Nylon in tension: error of the force, % of the curve's largest reading")
+    console = make_console()
+    table = make_table("Nylon in tension: error of the force, % of the curve's largest reading")
     for heading in (
         "angle",
         "fitted: rms",
@@ -46,7 +46,7 @@ def nylon(result: dict[str, Any], folder: Path) -> None:
         notes += [f"{name} not identifiable" for name in left["not_identifiable"]]
         table.add_row(f"{angle}°", *numbers, f"{100 * other['coverage']:.0f} %", "; ".join(notes))
     console.print(table)
-    table = _table("Nylon at angles that were not measured here: force [N], and the standard deviation's parts")
+    table = make_table("Nylon at angles that were not measured here: force [N], and the standard deviation's parts")
     for heading in ("angle", "strain", "force", "by parameters", "by the law", "by the preload", "95 % interval"):
         table.add_column(heading, justify="right")
     for angle, curve in result["between"].items():
@@ -61,7 +61,7 @@ def nylon(result: dict[str, Any], folder: Path) -> None:
 
 def knits(result: dict[str, Any]) -> None:
     """Print predictions of third pulls from the first two, with the scatter between pulls."""
-    table = _table(
+    table = make_table(
         f"Knits up to {MAX_ROBOT_FORCE_N:g} N: third pull from the first two, rms in % of its largest reading"
     )
     for heading in (
@@ -91,7 +91,7 @@ def knits(result: dict[str, Any]) -> None:
                 *cells,
                 ratio if label == "X" else "",
             )
-    console = _console()
+    console = make_console()
     console.print(table)
     console.print(
         "repeats differ: difference of the third pull from the mean of the first two, the noise floor of any law "
@@ -101,9 +101,9 @@ def knits(result: dict[str, Any]) -> None:
 
 def swings(result: dict[str, Any]) -> None:
     """Print ratios to the areal density, then the predictions."""
-    console = _console()
+    console = make_console()
     title = f"IRI swings: {len(result['fitted_runs'])} runs fitted. Only ratios to the areal density are identifiable"
-    table = _table(title)
+    table = make_table(title)
     for heading in ("", "whole runs, by identify", "frequency and decay of the free swings", "unit"):
         table.add_column(heading, justify="left" if heading in ("", "unit") else "right")
     for name, unit in RATIO_UNITS.items():
@@ -116,7 +116,7 @@ def swings(result: dict[str, Any]) -> None:
         "jackknife for whole runs, bootstrap for free swings"
     )
     predicted = result["predicted"]
-    table = _table(f"IRI swings: {len(result['predicted_runs'])} runs predicted; ± by bootstrap over these runs")
+    table = make_table(f"IRI swings: {len(result['predicted_runs'])} runs predicted; ± by bootstrap over these runs")
     for heading in ("", "node rms mm", "median mm", "swing Hz", "decay 1/(m s)"):
         table.add_column(heading, justify="right" if heading else "left")
     for key, label in MODEL_LABELS.items():
@@ -132,8 +132,8 @@ def swings(result: dict[str, Any]) -> None:
 
 def sample(result: dict[str, Any]) -> None:
     """Print the distances of all models in both directions."""
-    console, e = _console(), result["stiffness"]
-    table = _table(f"The paper's sample: {result['points']} points, mean distances in mm")
+    console, e = make_console(), result["stiffness"]
+    table = make_table(f"The paper's sample: {result['points']} points, mean distances in mm")
     for heading in ("", "cloud to surface", "cloud to vertices", "vertices to cloud"):
         table.add_column(heading, justify="right" if heading else "left")
     for name, row in result["distances"].items():
@@ -155,7 +155,8 @@ def _percent(share: float) -> str:
     return f"{100 * share:.1f}"
 
 
-def _console() -> Console:
+def make_console() -> Console:
+    """Make a console that is wide enough for the tables."""
     from rich.console import Console
 
     console = Console(highlight=False)
@@ -163,7 +164,8 @@ def _console() -> Console:
     return console
 
 
-def _table(title: str) -> Table:
+def make_table(title: str) -> Table:
+    """Make a table without columns."""
     from rich import box
     from rich.table import Table
 
