@@ -46,7 +46,7 @@ def test_fast_study(realdata, tmp_path):
         assert "Only ratios to the areal density are identifiable" in first.stdout
         entrained, plain = (result["timed"]["models"][label]["fitted"] for label in ("entrained", "no memory"))
         assert entrained["all"] < plain["all"]
-        assert entrained["lower"] < 0.7 * plain["lower"]
+        assert entrained["lower"] < 0.8 * plain["lower"]
         assert (out / "timed.png").is_file()
     if "carries" in result:
         carried = result["carries"]["models"]["entrained"]["still"]
