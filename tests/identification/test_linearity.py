@@ -23,7 +23,7 @@ def problem():
     solver = levenberg_marquardt.Problem(None, None, None, 0 * ONE, 5 * ONE, ONE, torch.tensor([least_squares.SIGMA_M]))
     objective = SimpleNamespace(
         problem=lambda: solver,
-        unknowns=[SimpleNamespace(name=name) for name in "abc"],
+        unknowns=[SimpleNamespace(name=name, measured=False) for name in "abc"],
         blocks=RESIDUAL_BLOCKS[:1],
         cloth=SimpleNamespace(mesh=SimpleNamespace(extent=1e9)),
         linearise_by_differences=lambda raw, steps: (linear, ParameterInfluence(ONE, ONE)),
@@ -46,6 +46,19 @@ def test_finite_steps_that_overflow_withdraw_the_tangents(problem, value):
     checked = linearity.check_linearity(objective, final)
     assert checked.is_withdrawn
     assert "tangents of b differ from finite steps" in checked.failure_reason
+
+
+def test_a_parameter_that_fails_alone_is_no_estimate_and_the_others_stay(problem):
+    objective, final = problem
+    secants = final.linear._replace(jacobian=final.linear.jacobian.clone())
+    secants.jacobian[:, 1] *= -1
+    objective.linearise_by_differences = lambda raw, steps: (secants, ParameterInfluence(ONE, ONE))
+    checked = linearity.check_linearity(objective, final)
+    assert not checked.is_withdrawn
+    assert checked.unusable_parameters == ("b",)
+    assert "no estimate of b" in checked.warnings[0]
+    assert torch.equal(checked.final.linear.jacobian[:, 1], secants.jacobian[:, 1])
+    assert torch.equal(checked.final.linear.jacobian[:, ::2], final.linear.jacobian[:, ::2])
 
 
 def test_without_grippers_that_feel_nothing_reaches_forces():

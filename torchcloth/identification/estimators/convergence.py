@@ -70,9 +70,13 @@ def remaining_std_errors(
     criteria: ConvergenceCriteria = CONVERGENCE_CRITERIA,
     ignored: Sequence[int] = (),
 ) -> float:
-    """Return how far the minimum is that the slopes predict, in standard errors of the reported unknowns."""
+    """Return how far the minimum is that the slopes predict, in standard errors of the reported unknowns.
+
+    Unknowns that are ``ignored`` stay where they are.
+    """
     gradient, hessian = levenberg_marquardt.normal_equations(problem, at)
     reach = criteria.max_prior_stds * problem.prior_std
+    reach[list(ignored)] = 0
     low, high = (problem.clip(at.raw + sign * reach) - at.raw for sign in (-1, 1))
     step = solve_box_qp(hessian, -gradient, low, high)
     return levenberg_marquardt.step_in_std_errors(problem, hessian, step, ignored)

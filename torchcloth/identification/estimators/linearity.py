@@ -110,11 +110,15 @@ def check_linearity(
     pairs = list(zip(objective.unknowns, error, strict=True))
     failing = [u.name for u, e in pairs if e >= criteria.max_relative_error]
     names, largest = ", ".join(failing), min(1000.0, 100 * float(error.max()))
-    is_runaway = has_runaway_tangents(objective, final, criteria)
-    if not is_runaway and any(u.name not in failing for u in objective.unknowns if not u.measured):
+    is_usable = not has_runaway_tangents(objective, final, criteria) and bool(secants.jacobian.isfinite().all())
+    if is_usable and any(u.name not in failing for u in objective.unknowns if not u.measured):
         warning = f"tangents of {names} differ from finite steps by up to {largest:.0f} %: no estimate of {names}"
+        jacobian = final.linear.jacobian.clone()
+        fails = error >= criteria.max_relative_error
+        jacobian[:, : len(steps)][:, fails] = secants.jacobian[:, : len(steps)][:, fails]
+        linear = final.linear._replace(jacobian=jacobian)
         return LinearityCheck(
-            final._replace(linear=secants), influence, [warning], [], unusable_parameters=tuple(failing)
+            final._replace(linear=linear), influence, [warning], [], unusable_parameters=tuple(failing)
         )
     reason = (
         f"the motion is unstable or strongly nonlinear at the solution (tangents of {names} differ from finite steps "

@@ -1,8 +1,8 @@
 """Pieces of a cloud's rim that lie beside the cloth's by different distances, for a whole episode.
 
-The offset of one piece is shared by its rows in all frames. It is marginalised: the rows' mean loses the share b, and so
-does that of their slopes, with 1 - b = (1 + n s^2 / e^2)^(-1/2) for n rows of noise e and offsets of standard deviation
-s. What is left has the weighted squares of generalised least squares.
+The offset of one piece is shared by its rows in all frames. It is marginalised: the rows' mean loses the share b, and
+so does that of their slopes, with 1 - b = (1 + n s^2 / e^2)^(-1/2) for n rows of noise e and offsets of standard
+deviation s. What is left has the weighted squares of generalised least squares.
 """
 
 from __future__ import annotations

@@ -48,7 +48,12 @@ def solution_covariance(objective: Objective, checked: LinearityCheck, strata: T
         return covariance
     if sampled is None and not final.converged:  # a search that was cut short is as uncertain as the remaining step
         gradient, hessian = levenberg_marquardt.normal_equations(problem, final)
-        remaining = torch.linalg.solve(hessian, gradient)
+        moves = torch.ones(len(gradient), dtype=torch.bool)
+        moves[: len(objective.unknowns)] = torch.tensor(
+            [u.name not in checked.unusable_parameters for u in objective.unknowns]
+        )
+        remaining = torch.zeros_like(gradient)
+        remaining[moves] = torch.linalg.solve(hessian[moves][:, moves], gradient[moves])
         variances = covariance.diagonal() + remaining.square()
         covariance = levenberg_marquardt.inflate_covariance(covariance, variances)
     return add_initial_shape_noise(objective, final, covariance, by_tangents=sampled is None)
