@@ -7,6 +7,7 @@ import pytest
 import torch
 from helpers import stretched_sheets, twins
 
+from torchcloth.episodes.grip_patch_mesh import grip_extent_range
 from torchcloth.episodes.replay import Frames, simulate
 from torchcloth.episodes.unknowns import collect_unknowns
 from torchcloth.errors import InvalidInput
@@ -93,7 +94,10 @@ def test_how_far_a_grip_reaches_has_its_slope_and_its_limits(pulled, monkeypatch
         slope = (result.evaluate(raw + step)[0] - result.evaluate(raw - step)[0]) / 1e-3
         assert float((slope - exact.jacobian[:, k]).norm()) < 0.1 * float(slope.norm()) != 0
     raw[1:] = torch.tensor([-1.0, 1.0])
-    assert result.clip(raw)[1:].tolist() == pytest.approx([-0.7 * radius, 0.7 * radius])
+    least, most = (f * radius for f in grip_extent_range(model))
+    assert -radius < least < -0.5 * radius
+    assert 0.5 * radius < most
+    assert result.clip(raw)[1:].tolist() == pytest.approx([least, most])
 
 
 def test_a_first_shape_that_was_not_measured_does_not_settle(pulled):

@@ -29,7 +29,8 @@ from .world import World, rebuild_cloth
 
 MAX_REMEMBERED_CLOTHS = 8  # that are gripped otherwise
 TAPER_RADII = 1.0  # distance over which the pattern around a patch gives way, in radii; farther out meshes differ more
-TRIED_EXTENTS = tuple(0.1 * k for k in range(7, 0, -1))  # changes of a patch's radius, in radii
+MAX_SHRINKAGE_RADII, MAX_GROWTH_RADII = 0.7, 1.5  # of a patch; smaller ones need ever shorter steps
+TRIED_FRACTIONS = tuple(0.1 * k for k in range(10, 0, -1))  # of these
 MIN_TRIANGLE_AREA_RATIO = 0.1  # of a stretched triangle to the original one
 
 
@@ -95,12 +96,12 @@ def grip_extent_range(cloth: Cloth) -> tuple[float, float]:
     """Return by how much the pattern lets all patches shrink (negative) and grow, in radii of each."""
     patches = grip_patches(cloth)
     ends = [0.0, 0.0]
-    for k, sign in enumerate((-1, 1)):
-        for fraction in TRIED_EXTENTS:
-            wider = {name: sign * fraction * patch.radius for name, patch in patches.items()}
+    for k, most in enumerate((-MAX_SHRINKAGE_RADII, MAX_GROWTH_RADII)):
+        for fraction in TRIED_FRACTIONS:
+            wider = {name: fraction * most * patch.radius for name, patch in patches.items()}
             with suppress(InvalidInput):
                 _stretch_pattern(cloth.mesh, patches, wider, 0.0)
-                ends[k] = sign * fraction
+                ends[k] = fraction * most
                 break
     return ends[0], ends[1]
 

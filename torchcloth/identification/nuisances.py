@@ -24,7 +24,7 @@ from ..errors import InvalidInput
 CAMERA_TURN_LEVER_M = 0.1  # distance at which a turned camera is off by as much as a shifted one
 GRASP_TURN_REACH = 0.25  # of the cloth's extent, over which the fabric around a grip turns along
 AXIS_NAMES = "xyz"
-GRIP_EXTENT_STD_RADII = 0.4  # of the patch that a gripper holds, in radii of the stated one
+GRIP_EXTENT_STD_RADII = 0.6  # of the patch that a gripper holds, in radii of the stated one
 # s, s, m, m, m
 BENCH_CAMERA_STDS: dict[str, float | None] = {
     "clock": 0.03,
