@@ -32,7 +32,15 @@ def test_causes_outside_the_cloth_are_said(model_file, monkeypatch):
     assert any("obs.clock" in note for note in export_fit(model_file, "newton").notes)
 
 
-def test_a_fit_without_its_episode_is_refused(tmp_path, capsys):
+def test_a_file_that_is_no_fit_is_named(tmp_path, capsys):
+    (tmp_path / "notes.json").write_text("{}")
+    said = refuse(capsys, tmp_path / "cloth.json", "export", tmp_path / "notes.json", "--to", "newton")
+    assert "notes.json" in said
+    assert "EPISODE" not in said
+
+
+def test_a_fit_without_its_episode_is_refused(tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr("torchcloth.export.write.read_saved_fit", lambda path: None)
     out = tmp_path / "new" / "cloth.json"
     said = refuse(capsys, out.parent / "cloth.json", "export", tmp_path, "--to", "newton")
     assert "EPISODE" in said

@@ -14,6 +14,7 @@ from ..cloth import Cloth
 from ..episodes.recorded_cloth import compute_initial_vertices
 from ..errors import InvalidInput
 from ..identification import load_fitted_cloth
+from ..identification.io.saved_fit import read_saved_fit
 from ..recordings import Recording
 from .mujoco import export_mujoco
 from .newton import export_newton
@@ -70,6 +71,7 @@ def export_fit(
     if fit.suffix == MODEL_SUFFIX:
         cloth = diagnosis.load(fit) if recording is None else diagnosis.load_cloth_for(fit, recording)
     elif recording is None:
+        read_saved_fit(fit)  # first of all it must be a fit
         raise InvalidInput(
             "EPISODE", got="none", expected="an episode that the fit used: identification.json has no mesh"
         )
