@@ -8,10 +8,10 @@ from helpers.command_line import refuse, write_twin
 from torchcloth.cli import main
 from torchcloth.errors import InvalidInput
 from torchcloth.identification import build_episode, fit, identify
-from torchcloth.identification.nuisances import BENCH_CAMERA_STDS, BENCH_CLOTH_STDS, bench_nuisances
+from torchcloth.identification.nuisances import BENCH_CAMERA_STDS, BENCH_CLOTH_STDS, BENCH_RIM_STDS, bench_nuisances
 
 EVERY_USE = ["points", "markers", "force"]
-CAMERA, CLOTH = {"clock", "jitter", "camera"}, {"grasp", "grip", "shape"}
+CAMERA, RIM, CLOTH = {"clock", "jitter", "camera"}, {"rim", "rim_scatter"}, {"grasp", "grip", "shape"}
 
 
 @pytest.fixture(scope="module")
@@ -48,17 +48,17 @@ def select(model, brief, selected):
 
 def test_a_camera_and_a_measured_first_shape_have_their_errors(model, brief):
     stds = bench_nuisances(EVERY_USE, [build_episode(model, brief)])
-    assert set(stds) == CAMERA | CLOTH
-    assert stds == BENCH_CAMERA_STDS | BENCH_CLOTH_STDS
+    assert set(stds) == CAMERA | RIM | CLOTH
+    assert stds == BENCH_CAMERA_STDS | BENCH_RIM_STDS | BENCH_CLOTH_STDS
 
 
 @pytest.mark.parametrize(
     ("uses", "changes", "names"),
     [
-        (["points"], {}, CAMERA | CLOTH),
+        (["points"], {}, CAMERA | RIM | CLOTH),
         (["force"], {}, CLOTH),  # the camera's frames are not in use
         (["markers"], {"clouds": []}, CLOTH),  # there is no camera
-        (["points"], {"needs_settling": False}, CAMERA),  # the first shape is the rest shape, or was computed
+        (["points"], {"needs_settling": False}, CAMERA | RIM),  # the first shape is the rest shape, or was computed
         (["force"], {"needs_settling": False}, set()),
     ],
 )
@@ -68,7 +68,7 @@ def test_errors_join_by_the_data_that_have_them(model, brief, uses, changes, nam
 
 def test_every_bench_error_is_an_unknown_by_default(select):
     stds = select()
-    assert set(stds) == CAMERA | CLOTH | {"rim"}
+    assert set(stds) == CAMERA | RIM | CLOTH
     assert {name: stds[name] for name in ("clock", "camera", "shape")} == {
         "clock": 0.03,
         "camera": 0.004,
@@ -79,7 +79,7 @@ def test_every_bench_error_is_an_unknown_by_default(select):
 def test_a_stated_deviation_replaces_the_default_and_zero_leaves_one_out(select):
     stds = select(nuisances={"clock": 0.2, "grip": 0})
     assert stds["clock"] == pytest.approx(0.2)
-    assert set(stds) == (CAMERA | CLOTH | {"rim"}) - {"grip"}
+    assert set(stds) == (CAMERA | RIM | CLOTH) - {"grip"}
 
 
 def test_an_exact_bench_has_what_is_named_only(select):
@@ -94,8 +94,8 @@ def test_other_methods_take_the_bench_as_exact(select):
 @pytest.mark.parametrize(
     ("options", "names"),
     [
-        ([], CAMERA | CLOTH),
-        (["--nuisance", "clock=0"], (CAMERA | CLOTH) - {"clock"}),
+        ([], CAMERA | CLOTH | {"rim_scatter"}),
+        (["--nuisance", "clock=0"], (CAMERA | CLOTH | {"rim_scatter"}) - {"clock"}),
         (["--exact-bench"], set()),
         (["--exact-bench", "--nuisance", "camera"], {"camera"}),
     ],

@@ -123,7 +123,7 @@ def test_an_unstable_motion_is_said_and_differences_replace_tangents():
 
     def made(name, secant):
         cloth, blocks = SimpleNamespace(mesh=SimpleNamespace(extent=1.0)), [SimpleNamespace(unit="m")]
-        return Fake(unknowns=[SimpleNamespace(name=name)], blocks=blocks, cloth=cloth, secant=secant)
+        return Fake(unknowns=[SimpleNamespace(name=name, measured=False)], blocks=blocks, cloth=cloth, secant=secant)
 
     at_start = at_slope(1.0)
     for secant, warned, bent in ((1.2, False, []), (1.4, False, ["youngs_modulus"]), (5.0, True, [])):

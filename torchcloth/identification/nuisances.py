@@ -25,14 +25,8 @@ CAMERA_TURN_LEVER_M = 0.1  # distance at which a turned camera is off by as much
 GRASP_TURN_REACH = 0.25  # of the cloth's extent, over which the fabric around a grip turns along
 AXIS_NAMES = "xyz"
 GRIP_EXTENT_STD_RADII = 0.6  # of the patch that a gripper holds, in radii of the stated one
-# s, s, m, m, m
-BENCH_CAMERA_STDS: dict[str, float | None] = {
-    "clock": 0.03,
-    "jitter": None,
-    "camera": 0.004,
-    "rim": 0.005,
-    "rim_scatter": None,
-}
+BENCH_CAMERA_STDS: dict[str, float | None] = {"clock": 0.03, "jitter": None, "camera": 0.004}  # s, s, m
+BENCH_RIM_STDS: dict[str, float | None] = {"rim": 0.005, "rim_scatter": None}  # m
 BENCH_CLOTH_STDS: dict[str, float | None] = {"grasp": None, "grip": None, "shape": 0.004}  # m
 MAX_CLOCK_OFFSET_STDS = 2.0  # for which a simulation goes on after the last frame
 
@@ -371,10 +365,14 @@ def bench_nuisances(uses: Collection[str], episodes: Sequence[Episode]) -> dict[
         uses: names of the kinds of data in use.
         episodes: the recordings.
     """
-    has_camera = any(e.markers is not None or any(map(len, e.clouds)) for e in episodes)
-    is_seen = has_camera and not {"points", "markers"}.isdisjoint(uses)
+    has_points = "points" in uses and any(any(map(len, e.clouds)) for e in episodes)
+    has_markers = "markers" in uses and any(e.markers is not None for e in episodes)
     is_measured = any(e.is_first_shape_measured for e in episodes)
-    return (BENCH_CAMERA_STDS if is_seen else {}) | (BENCH_CLOTH_STDS if is_measured else {})
+    return (
+        (BENCH_CAMERA_STDS if has_points or has_markers else {})
+        | (BENCH_RIM_STDS if has_points else {})
+        | (BENCH_CLOTH_STDS if is_measured else {})
+    )
 
 
 def as_stds(wanted: Mapping[str, float | None] | Sequence[str]) -> dict[str, float | None]:

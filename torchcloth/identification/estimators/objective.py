@@ -174,7 +174,9 @@ class Objective:
     def clip(self, raw: Tensor) -> Tensor:
         """Return the nearest legal point [K]."""
         legal = [u.clip(float(r)) for u, r in zip(self.unknowns, raw, strict=False)]
-        return torch.cat([torch.tensor(legal, dtype=raw.dtype), raw[len(legal) :].clamp(*self.nuisance_bounds.T)])
+        end = len(legal) + len(self.nuisance_bounds)
+        nuisances = raw[len(legal) : end].clamp(*self.nuisance_bounds.T)
+        return torch.cat([torch.tensor(legal, dtype=raw.dtype), nuisances, raw[end:]])
 
     def start_with(self, values: Mapping[str, float]) -> Tensor:
         """Return the unconstrained start [K] with some physical values replaced, by parameter name.
