@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from .paper_fabrics import FABRICS, SYMBOLS
@@ -37,6 +37,12 @@ def make_table(title: str, *headings: str, left: int = 2):
     for i, heading in enumerate(headings):
         out.add_column(heading, justify="left" if i < left else "right", no_wrap=True)
     return out
+
+
+def make_markdown_table(headings: Sequence[str], rows: Sequence[Sequence[str]], left: int = 2) -> str:
+    """Return a table as Markdown, whose first ``left`` columns are left-aligned."""
+    rule = ["---" if k < left else "---:" for k in range(len(headings))]
+    return "".join(f"| {' | '.join(line)} |\n" for line in (headings, rule, *rows))
 
 
 def _stretched(result: Mapping[str, Any]):

@@ -34,7 +34,7 @@ from torchcloth.inspection.corrections import find_frozen_clouds
 from ..resumable import ResumableStudy, check_jobs, write_result
 from ..validation.independent.rig_recording import GRIP_RADIUS_M, MeshSize, RigRecording, make_rig_recording
 from ..validation.independent.towel import TOWEL_CASES, TRUTH_NODES, make_towel_recording
-from .fabric_tables import NO_VALUE, make_table
+from .fabric_tables import NO_VALUE, make_markdown_table, make_table
 from .hidden_rates import Rate
 
 RIG_COUNT, FAST_RIG_COUNT = 40, 2
@@ -76,9 +76,7 @@ def run(options: argparse.Namespace) -> None:
         return
     interpreters = {THIS_VERSION: sys.executable}
     if options.compare is not None:
-        name, _, python = options.compare.partition("=")
-        if not name or not python or shutil.which(python) is None:
-            raise InvalidInput("--compare", got=repr(options.compare), expected="NAME=PYTHON, an interpreter")
+        name, python = parse_comparison(options.compare)
         interpreters |= {name: python, f"{name}, {NOISE_STATED}": python}
     study = ResumableStudy(options.out, {"study": "honesty", "fast": options.fast})
     study.start()
@@ -97,6 +95,18 @@ def run(options: argparse.Namespace) -> None:
     path = write_result(options.out / "honesty.json", "honesty", {"answers": answers, "poses": pose_cases})
     write_text(options.out / "honesty.md", to_markdown(answers, pose_cases))
     print(f"result: {path}, {options.out / 'honesty.md'}")
+
+
+def parse_comparison(text: str) -> tuple[str, str]:
+    """Return name and interpreter of another installation, from NAME=PYTHON.
+
+    Raises:
+        InvalidInput: another form, or no such interpreter.
+    """
+    name, _, python = text.partition("=")
+    if not name or not python or shutil.which(python) is None:
+        raise InvalidInput("--compare", got=repr(text), expected="NAME=PYTHON, an interpreter")
+    return name, python
 
 
 def case_name(seed: int, version: str) -> str:
@@ -398,14 +408,14 @@ def print_tables(answers: Answers, poses: Mapping[int, Mapping[str, Any]]) -> No
 
 def to_markdown(answers: Answers, poses: Mapping[int, Mapping[str, Any]]) -> str:
     """Return the tables as Markdown."""
-
-    def table(headings: Sequence[str], rows: Sequence[Sequence[str]], left: int) -> str:
-        rule = ["---" if k < left else "---:" for k in range(len(headings))]
-        return "".join(f"| {' | '.join(line)} |\n" for line in (headings, rule, *rows))
-
     parts = (
-        table(SUMMARY_HEADINGS, summarise(answers), 1),
-        table(CASE_HEADINGS, _case_rows(answers), 4),
-        table(POSE_HEADINGS, _pose_rows(poses), 3),
+        make_markdown_table(SUMMARY_HEADINGS, summarise(answers), 1),
+        case_table(answers),
+        make_markdown_table(POSE_HEADINGS, _pose_rows(poses), 3),
     )
     return "\n".join(parts)
+
+
+def case_table(answers: Answers) -> str:
+    """Return the table of every number as Markdown."""
+    return make_markdown_table(CASE_HEADINGS, _case_rows(answers), 4)

@@ -10,7 +10,7 @@ import numpy as np
 
 from torchcloth._utils.files import save_figure
 
-from .fabric_tables import NO_VALUE, make_table
+from .fabric_tables import NO_VALUE, make_markdown_table, make_table
 from .hidden_rates import Rate
 
 Results = Mapping[int, Mapping[str, Any]]  # seed -> facts and methods
@@ -148,13 +148,8 @@ def print_tables(results: Results, networks: Sequence[str]) -> None:
 
 def to_markdown(results: Results, networks: Sequence[str]) -> str:
     """Return the tables as Markdown."""
-
-    def table(headings: Sequence[str], rows: Sequence[Sequence[str]], left: int) -> str:
-        rule = ["---" if k < left else "---:" for k in range(len(headings))]
-        return "".join(f"| {' | '.join(line)} |\n" for line in (headings, rule, *rows))
-
-    methods = table(METHOD_HEADINGS, _method_rows(results, networks), 1)
-    return methods + "\n" + table(_episode_headings(results), _episode_rows(results), 4)
+    methods = make_markdown_table(METHOD_HEADINGS, _method_rows(results, networks), 1)
+    return methods + "\n" + make_markdown_table(_episode_headings(results), _episode_rows(results), 4)
 
 
 def write_picture(results: Results, path: Path) -> Path:

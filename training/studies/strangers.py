@@ -9,7 +9,6 @@ them. ``--compare`` lets the ``identify`` of another installation fit the same e
 from __future__ import annotations
 
 import argparse
-import shutil
 import sys
 import threading
 from collections import defaultdict
@@ -22,7 +21,7 @@ from torchcloth._utils.files import write_text
 from torchcloth.errors import InvalidInput
 
 from ..resumable import ResumableStudy, check_jobs, write_result
-from .honesty import THIS_VERSION, case_name, fit_recording
+from .honesty import THIS_VERSION, case_name, fit_recording, parse_comparison
 from .strangers_episodes import find_or_make_episode
 from .strangers_tables import print_tables, write_markdown
 
@@ -57,9 +56,7 @@ def run(options: argparse.Namespace) -> None:
         raise InvalidInput("--benches, --first", got=f"{count}, {options.first}", expected="1 or more; 0 or more")
     interpreters = {THIS_VERSION: sys.executable}
     if options.compare is not None:
-        name, _, python = options.compare.partition("=")
-        if not name or not python or shutil.which(python) is None:
-            raise InvalidInput("--compare", got=repr(options.compare), expected="NAME=PYTHON, an interpreter")
+        name, python = parse_comparison(options.compare)
         interpreters[name] = python
     study = ResumableStudy(options.out, {"study": "strangers", "fast": options.fast})
     study.start()

@@ -6,8 +6,8 @@ from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 from ..validation.independent.stranger_bench import HOLDINGS
-from .fabric_tables import NO_VALUE, make_table
-from .honesty import PARAMETER_SYMBOLS, SUMMARY_HEADINGS, Answers, summarise, to_markdown
+from .fabric_tables import NO_VALUE, make_markdown_table, make_table
+from .honesty import PARAMETER_SYMBOLS, SUMMARY_HEADINGS, Answers, case_table, summarise
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -112,16 +112,10 @@ def write_markdown(answers: Answers, episodes: Mapping[int, Mapping[str, Any]]) 
         }
         for version, cases in answers.items()
     }
-    _, every_bench, _ = to_markdown(described, {}).split("\n\n")
     return "\n".join(
         (
-            _table(SCORE_HEADINGS, score(answers), left=2),
-            f"{every_bench}\n",
-            _table(QUALITY_HEADINGS, quality_rows(episodes), left=3),
+            make_markdown_table(SCORE_HEADINGS, score(answers), left=2),
+            case_table(described),
+            make_markdown_table(QUALITY_HEADINGS, quality_rows(episodes), left=3),
         )
     )
-
-
-def _table(headings: Sequence[str], rows: Sequence[Sequence[str]], left: int) -> str:
-    rule = ["---" if k < left else "---:" for k in range(len(headings))]
-    return "".join(f"| {' | '.join(line)} |\n" for line in (headings, rule, *rows))

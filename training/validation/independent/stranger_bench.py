@@ -291,7 +291,7 @@ def make_bench(seed: int, size: BenchSize | None = None) -> StrangerBench:
         true_parameters(scene),
         scene.sheet,
         faults.mass * scene.sheet.areal_density * scene.sheet.width * scene.sheet.height,
-        _held_places(holding, scene.sheet),
+        _list_grasped_places(holding, scene.sheet),
         rig,
         np.concatenate([t[0] - margin[::-1], t, t[-1] + margin]),
         {name: np.pad(q, (repeats, (0, 0)), mode="edge") for name, q in joints.items()},
@@ -337,7 +337,7 @@ def _grid_lines(length: float, held_low: float, held_high: float, spacing: float
     return (*map(float, np.concatenate(parts)), length)
 
 
-def _held_places(holding: str, sheet: SheetSpec) -> dict[str, Array]:
+def _list_grasped_places(holding: str, sheet: SheetSpec) -> dict[str, Array]:
     if holding == "bar":
         return {ONE_ARM_NAME: np.array([sheet.width / 2, sheet.height])}
     if holding == "corner":
@@ -410,7 +410,7 @@ def _simulate(
     middle, turn = np.mean([pose[:3, 3] for pose in first], axis=0), first[0][:3, :3]
     x0 = middle + _hang(rng, scene.sheet, holding, uv) @ turn.T
     grips = {}
-    for name, place in _held_places(holding, scene.sheet).items():
+    for name, place in _list_grasped_places(holding, scene.sheet).items():
         below = np.abs(uv - place)
         if holding == "bar":
             below[:, 0] = 0.0
