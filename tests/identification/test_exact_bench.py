@@ -106,6 +106,6 @@ def test_the_command_says_which_errors_are_unknown(folder, tmp_path, capsys, sel
 
 
 def test_the_demo_has_an_exact_bench(tmp_path, selected):
-    """MuJoCo recorded it."""
+    """MuJoCo recorded the demo, so nothing is off but the sensors."""
     assert main(["demo", "--no-refine", "--out", str(tmp_path / "out")]) == 2
     assert set(selected) == {"rim"}

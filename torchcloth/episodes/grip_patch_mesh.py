@@ -51,6 +51,12 @@ class StretchedCloth(NamedTuple):
         """Return values [..., V, C] of the original vertices at the stretched ones."""
         return interpolate_on_pattern(self.to_stretched, values)
 
+    def take_start(self, episode: Episode) -> Episode:
+        """Return the episode with its first state at the stretched vertices."""
+        velocity = episode.initial_velocity
+        velocity = None if velocity is None else self.take(velocity)
+        return replace(episode, initial=self.take(episode.initial), initial_velocity=velocity)
+
     def view(self, frames: Frames) -> Frames:
         """Return frames, or derivatives of them, at the original vertices."""
         x, v = (interpolate_on_pattern(self.to_original, value) for value in (frames.x, frames.v))
@@ -157,13 +163,12 @@ def move_grip_patches(world: World, wider: float = 0.0, along: float = 0.0) -> W
         return world
     stretched = stretch_around_grips(world.cloth, dict.fromkeys(patches, wider), along)
 
-    def motion(episode: Episode) -> Episode:
-        return replace(episode, initial=stretched.take(episode.initial))
-
     def view(frames: Frames, _: Episode) -> Frames:
         return stretched.view(frames)
 
-    return World(stretched.cloth, (*world.motion_transforms, motion), (view, *world.observation_transforms))
+    return World(
+        stretched.cloth, (*world.motion_transforms, stretched.take_start), (view, *world.observation_transforms)
+    )
 
 
 def _stretch_pattern(mesh: Mesh, patches: Mapping[str, Patch], wider: Mapping[str, float], along: float) -> np.ndarray:

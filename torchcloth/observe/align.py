@@ -96,11 +96,11 @@ def align(
     grasped = torch.as_tensor(np.asarray(held_vertices, dtype=np.int64))
     poses = register_rigidly(x, torch.as_tensor(mesh.faces), cloud_points)
     if len(grasped):
-        poses = [pose for pose in poses if _held_distance(pose, x[grasped]) <= MAX_HELD_DISTANCE_M]
+        poses = [pose for pose in poses if _measure_move(pose, x[grasped]) <= MAX_HELD_DISTANCE_M]
         poses.append(Pose(torch.eye(3, dtype=x.dtype), x.new_zeros(3)))
     alignments = []
     for pose in poses:
-        pull = partial(_held_equations, grasped, x[grasped])
+        pull = partial(_grasp_equations, grasped, x[grasped])
         x_bent = _bend(mesh, pose.transform(x), cloud_points, points, eye, noise, strain, pull)
         alignments.append(_measure_alignment(mesh, x_bent, pose, cloud_points, points, eye, noise))
         if alignments[-1].rms <= GOOD_RMS_RATIO * noise:
@@ -110,12 +110,12 @@ def align(
     return best
 
 
-def _held_distance(pose: Pose, places: Tensor) -> float:
+def _measure_move(pose: Pose, places: Tensor) -> float:
     """Largest distance [m] by which a pose moves places [H, 3] m."""
     return float((pose.transform(places) - places).norm(dim=-1).max())
 
 
-def _held_equations(vertices: Tensor, places: Tensor, x: Tensor) -> list[Equations]:
+def _grasp_equations(vertices: Tensor, places: Tensor, x: Tensor) -> list[Equations]:
     """Held vertices [H] are at their places [H, 3] m."""
     weight = x.new_full((len(vertices), 1), 1 / HELD_PLACE_STD_M)
     return expand_to_axes(vertices.unsqueeze(-1), weight, (places - x[vertices]) / HELD_PLACE_STD_M)

@@ -51,7 +51,7 @@ class FrameTimeSettings:
 
 FRAME_TIME_SETTINGS = FrameTimeSettings()
 BISECTION_COUNT = 30  # of the stamps' standard deviation
-CAMERA_BLOCKS = ("points", "edges", "markers")
+CAMERA_BLOCKS = ("points", "edges", "markers")  # whose data are on the camera's clock
 
 
 @dataclass(frozen=True)
@@ -132,7 +132,7 @@ class FrameTimes:
         """Sum up what the rows say about the times of the frames."""
         simulated = match_points(frames, time_derivatives(frames), scene.episode, scene.surface)
         sums = frames.x.new_zeros(2, len(frames.x))
-        for block in camera_blocks(scene.blocks):
+        for block in (block for block in scene.blocks if block.name in CAMERA_BLOCKS):
             rows = block.rows(simulated)
             if rows is not None:
                 slope = _require(rows.jacobian)[:, 0]
@@ -187,11 +187,6 @@ def join_derivatives(first: Frames, second: Frames) -> Frames:
     wrench = {name: torch.cat([w, second.wrench[name]]) for name, w in first.wrench.items()}
     x, v, rim = (torch.cat([getattr(d, name) for d in (first, second)]) for name in ("x", "v", "rim_offset"))
     return Frames(x, v, wrench, rim)
-
-
-def camera_blocks(blocks: Sequence[Block]) -> list[Block]:
-    """Return the blocks whose data are on the camera's clock."""
-    return [block for block in blocks if block.name in CAMERA_BLOCKS]
 
 
 def estimate_stamp_std(times: FrameTimes, frames: Sequence[Frames], scenes: Sequence[Scene]) -> float:

@@ -271,10 +271,11 @@ class Objective:
 
     def _simulate_cloth(self, raw: Tensor, i: int) -> Frames:
         """Simulate episode ``i`` as an observer without errors sees it."""
-        cloth, stretched = self._gripped_cloth(raw, i)
-        episode = self._initial_state(raw, i)[0]
-        frames = simulate(cloth, self.unknowns, raw[: len(self.unknowns)], episode, self.dt)
-        return frames if stretched is None else stretched.view(frames)
+        (cloth, stretched), episode = self._gripped_cloth(raw, i), self._initial_episode(raw, i)
+        fabric = raw[: len(self.unknowns)]
+        if stretched is None:
+            return simulate(cloth, self.unknowns, fabric, episode, self.dt)
+        return stretched.view(simulate(cloth, self.unknowns, fabric, stretched.take_start(episode), self.dt))
 
     def _gripped_cloth(self, raw: Tensor, i: int) -> tuple[Cloth, StretchedCloth | None]:
         """Return the cloth as it is gripped in episode ``i``, and where the pattern is stretched for that."""
@@ -294,7 +295,7 @@ class Objective:
             raw: [K].
             std: of a stamp [s]; None: estimated.
         """
-        exact = self.with_frame_times(None)
+        exact = self if self.frame_times is None else self.with_frame_times(None)  # its frames are remembered
         point = levenberg_marquardt.evaluate_point(self.problem(), raw, exact.evaluate_all(raw))
         noise = zip(point.scale.tolist(), point.effective_fraction.tolist(), point.outlier_cutoff.tolist(), strict=True)
         blocks = zip(self.blocks, noise, strict=False)
@@ -302,7 +303,8 @@ class Objective:
         if std is None:
             scenes = [self.scene(i) for i in range(len(self.episodes))]
             times = replace(times, std=estimate_stamp_std(times, exact.observe(raw), scenes))
-        self.simulations += len(self.episodes)
+        if exact is not self:
+            self.simulations += len(self.episodes)
         return times if times.std > 0 else None
 
     def scene(self, i: int) -> Scene:
@@ -336,22 +338,12 @@ class Objective:
         initial = episode.initial + torch.einsum("k,kvc->vc", values, modes.x)
         return replace(episode, initial=initial, initial_velocity=velocity)
 
-    def _initial_state(self, raw: Tensor, i: int) -> tuple[Episode, list[int], StateModes]:
-        """Return the episode with its first state, columns that change it, and how, on the gripped cloth's mesh."""
-        episode, (columns, modes) = self._initial_episode(raw, i), self._first_state_modes(i)
-        stretched = self._gripped_cloth(raw, i)[1]
-        if stretched is not None:
-            velocity = episode.initial_velocity
-            velocity = None if velocity is None else stretched.take(velocity)
-            episode = replace(episode, initial=stretched.take(episode.initial), initial_velocity=velocity)
-            modes = StateModes(stretched.take(modes.x), stretched.take(modes.v))
-        return episode, columns, modes
-
     def _tangents(self, raw: Tensor, i: int, by_fabric: bool = True) -> tuple[Frames, Frames]:
         """One episode, and its derivatives by all unknowns; those by the fabric's are zero if not ``by_fabric``."""
-        episode, mode_columns, modes = self._initial_state(raw, i)
-        cloth, stretched = self._gripped_cloth(raw, i)
-        fabric = raw[: len(self.unknowns)]
+        (mode_columns, modes), episode = self._first_state_modes(i), self._initial_episode(raw, i)
+        (cloth, stretched), fabric = self._gripped_cloth(raw, i), raw[: len(self.unknowns)]
+        if stretched is not None:
+            episode, modes = stretched.take_start(episode), StateModes(*map(stretched.take, modes))
         frames, computed = simulate_with_tangents(cloth, self.unknowns, fabric, episode, self.dt, modes, by_fabric)
         columns = torch.tensor([*range(len(self.unknowns) if by_fabric else 0), *mode_columns])
         if stretched is not None:
@@ -546,13 +538,13 @@ class Objective:
         """Residual rows; slopes by the first ``followed_by`` unknowns already say that times of frames follow them."""
         parts: list[tuple[int, int, int, ResidualRows]] = []
         first_frame = 0
+        scatter = next((n for n in self.nuisances if isinstance(n, RimScatter)), None)
         for i, ((frames, derivatives), episode) in enumerate(zip(simulated, self.episodes, strict=True)):
             if self.frame_times is None or derivatives is None:
                 simulated_episode = match_points(frames, derivatives, episode, self.surface)
                 rows_by_block = {block.name: block.rows(simulated_episode) for block in self.blocks}
             else:
                 rows_by_block = self.frame_times.project(frames, derivatives, self.scene(i), followed_by)
-            scatter = next((n for n in self.nuisances if isinstance(n, RimScatter)), None)
             for b, block in enumerate(self.blocks):
                 rows = rows_by_block[block.name]
                 if rows is not None and block.name == "edges" and scatter is not None:
