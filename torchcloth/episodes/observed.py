@@ -175,6 +175,10 @@ class Episode:
         clouds = [c[:0] if late else c for c, late in zip(self.clouds, is_late.tolist(), strict=True)]
         return replace(self, clouds=clouds, markers=markers)
 
+    def with_thinned_clouds(self, points_per_frame: int) -> Episode:
+        """Return the episode with about so many points in a frame: every n-th one of the order in the cloud."""
+        return replace(self, clouds=[cloud[:: max(1, len(cloud) // points_per_frame)] for cloud in self.clouds])
+
     def first_fraction(self, fraction: float) -> Episode:
         """Return the first ``fraction`` of the frames, at least four."""
         count = min(self.observed_count, max(MIN_FRAMES_OF_PART, round(fraction * self.observed_count)))

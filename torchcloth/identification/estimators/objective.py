@@ -102,6 +102,10 @@ class Objective:
         episodes = [e.first_fraction(fraction) for e in self.episodes]
         return self._with_episodes(add_lookahead(episodes, self.nuisances), self.nuisances)
 
+    def with_thinned_clouds(self, points_per_frame: int) -> Objective:
+        """Return the objective of clouds with about as many points, evenly taken."""
+        return self._with_episodes([e.with_thinned_clouds(points_per_frame) for e in self.episodes], self.nuisances)
+
     def with_nuisances(self, nuisances: Sequence[AbstractNuisance]) -> Objective:
         """Return the objective with other nuisances."""
         return self._with_episodes(self.episodes, nuisances)
@@ -262,7 +266,10 @@ class Objective:
 
     def simulate(self, raw: Tensor, i: int) -> Frames:
         """Simulate episode ``i``; differentiable in reverse mode when ``raw`` [K] requires grad."""
-        frames = self._simulate_cloth(raw, i)
+        return self._observe(raw, i, self._simulate_cloth(raw, i))
+
+    def _observe(self, raw: Tensor, i: int, frames: Frames) -> Frames:
+        """Observe frames of episode ``i`` with the observer's errors."""
         for s in self.nuisance_slices[i]:
             frames = s.nuisance.observe(frames, raw[s.index].to(frames.x), self.episodes[i])
         if self.frame_times is not None:
@@ -354,6 +361,12 @@ class Objective:
 
         derivatives = map_frames(computed, spread)
         self._differentiate_by_grip_extents(raw, i, frames, derivatives)
+        return self._observe_with_derivatives(raw, i, frames, derivatives)
+
+    def _observe_with_derivatives(
+        self, raw: Tensor, i: int, frames: Frames, derivatives: Frames
+    ) -> tuple[Frames, Frames]:
+        """Observe frames of episode ``i`` and their derivatives (K in front) with the observer's errors."""
         for s in self.nuisance_slices[i]:
             frames, derivatives = apply_nuisance(s, frames, derivatives, raw, self.episodes[i])
         if self.frame_times is not None:
@@ -421,6 +434,30 @@ class Objective:
         if last is not None and last[0] == tuple(raw.tolist()):
             return last[1]
         return [self._tangents(raw, i) for i in range(len(self.episodes))]
+
+    def observer_problem(self, raw: Tensor) -> levenberg_marquardt.Problem:
+        """Return the problem of the observer's errors, of cloth that moves as at ``raw``: one simulation is enough."""
+        self._count_simulations(raw)
+        is_observers = torch.zeros(len(raw), dtype=torch.bool)
+        for s in (s for slices in self.nuisance_slices for s in slices if not s.nuisance.acts_on_cloth):
+            is_observers[s.index] = True
+        with torch.no_grad():
+            simulated = [self._simulate_cloth(raw, i) for i in range(len(self.episodes))]
+
+        def linearise(at: Tensor) -> levenberg_marquardt.Linearised:
+            seen = []
+            for i, frames in enumerate(simulated):
+                none = map_frames(frames, lambda x: x.new_zeros(len(raw), *x.shape))
+                seen.append(self._observe_with_derivatives(at, i, frames, none))
+            return levenberg_marquardt.Linearised(*self._rows(seen))
+
+        def evaluate(at: Tensor) -> tuple[Tensor, Tensor]:
+            rows = self._rows([(self._observe(at, i, frames), None) for i, frames in enumerate(simulated)])
+            return rows.residual, rows.error_group
+
+        problem = self.problem()
+        prior_mean = torch.where(is_observers, problem.prior_mean, raw)
+        return problem._replace(linearise=linearise, evaluate=evaluate, prior_mean=prior_mean)
 
     def linearise_first_shape(self, raw: Tensor) -> levenberg_marquardt.Linearised:
         """Compute residual rows with derivatives by the nuisances alone; those by the fabric's unknowns are zero."""

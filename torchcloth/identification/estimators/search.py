@@ -13,7 +13,7 @@ from ..nuisances import StampJitter
 from ..uncertainty.consider_covariance import points_misfit, solution_covariance
 from ..uncertainty.estimates import make_estimates
 from ..uncertainty.misfit import find_misfit
-from . import levenberg_marquardt, linearity, multistart, predictability, statistical_linearisation
+from . import cross_entropy, levenberg_marquardt, linearity, multistart, predictability, statistical_linearisation
 from .convergence import find_failure_reason
 from .gradient_descent import chamfer_to_nearest_vertex, minimise_by_gradient_descent, minimise_by_lbfgs
 from .objective import Objective
@@ -109,9 +109,10 @@ class Search:
             starts = self._search_from_several(start, count, iterations)
             start = starts.raw
         elif early and method == "gauss-newton":
-            start = self._fit_roughly(full.first_fraction(EARLY_FRAME_FRACTION), start, iterations)
             if any(nuisance.acts_on_cloth for nuisance in full.nuisances):
-                start = self._fit_roughly(full, start, iterations)
+                start = self._search_by_draws(start)
+            else:
+                start = self._fit_early_frames(full.first_fraction(EARLY_FRAME_FRACTION), start, iterations).raw
         final = self._fit_all_frames(method, start, iterations, rate)
         for _ in range(MAX_STAMP_ROUNDS):
             if not self._estimate_stamps(final.raw):
@@ -232,13 +233,15 @@ class Search:
             self.on_progress(len(self.history) - 1, chamfer, self.objective.physical_values(at.raw), 1.0)
         return False
 
-    def _fit_roughly(self, part: Objective, start: Tensor, iterations: int) -> Tensor:
-        """Fit frames as far as is cheap: without nuisances that act on the cloth, whose slopes need simulations."""
-        rough = part.with_nuisances([n for n in part.nuisances if not n.acts_on_cloth])
-        if not rough.has_data:
-            return start
-        full, begin = self.objective, rough.take_unknowns(start, self.objective)
-        end = self._fit_early_frames(rough, begin, iterations).raw
+    def _search_by_draws(self, start: Tensor) -> Tensor:
+        """Search by simulations of fabrics alone, with the errors of the observer that are numbers of the search."""
+        full = self.objective
+        nuisances = [n for n in full.nuisances if not n.acts_on_cloth]
+        thinned = full.with_thinned_clouds(cross_entropy.CROSS_ENTROPY_SETTINGS.points_per_frame)
+        rough = thinned.with_nuisances(nuisances).with_frame_times(None)
+        end = cross_entropy.search_by_draws(
+            rough, rough.take_unknowns(start, full), lambda raw: self.append_history(raw, rough)
+        )
         self.partial_simulations += rough.simulations
         return full.take_unknowns(end, rough)
 

@@ -66,6 +66,7 @@ CORNER_SIDE_RANGE_M, CORNER_ASPECT_RANGE = (0.30, 0.36), (0.65, 0.78)
 TOP_EDGE_M = (0.50, 0.0)  # x and y of the middle of what is held, at rest
 HEADING_RANGE_RAD = 0.35
 MAX_YAW_RAD = 0.7  # of the motion "turn", which no camera sees if it goes to a right angle
+SHAKE_TILT_RAD = np.deg2rad(45.0)  # of the motion "shake", from the vertical
 STILL_AFTERWARDS_S = 0.35  # the cloth swings on
 BULGE_STD_M = 2e-3  # of the flat sheet before it settles, since a plane is a bifurcation
 CORNER_FOLD_M = 0.02  # a flat sheet does not hang from a corner: its sides fold towards each other
@@ -379,7 +380,7 @@ def _draw_path(rng: np.random.Generator, holding: str, motion: str, sheet: Sheet
         turned = np.asarray(waypoints.yaw)
         yaw += minimum_jerk(t, knots, MAX_YAW_RAD / np.abs(turned).max() * turned)
     below = np.hypot(sheet.width, sheet.height) if holding == "corner" else sheet.height
-    offset = minimum_jerk(t, knots, np.asarray(waypoints.offset, float))
+    offset = minimum_jerk(t, knots, _tilt_shake(np.asarray(waypoints.offset, float), holding, motion))
     centre = np.array([*TOP_EDGE_M, CLEARANCE_M + below]) + offset @ rotations_about_z(np.array([heading]))[0].T
     turn, poses = rotations_about_z(yaw), {}
     distance = TAUT_DISTANCE_RATIO * sheet.width if holding == "corners" else 0.0
@@ -388,6 +389,16 @@ def _draw_path(rng: np.random.Generator, holding: str, motion: str, sheet: Sheet
         poses[name][:, :3, :3] = turn
         poses[name][:, :3, 3] = centre + turn @ np.array([0.0, ARM_SIDES.get(name, 0.0) * distance / 2, 0.0])
     return t, poses
+
+
+def _tilt_shake(offset: Array, holding: str, motion: str) -> Array:
+    """Return waypoints [N, 3] m: a shake goes forwards as far as upwards, unless the sheet hangs from one corner.
+
+    A sheet that hangs in its plane moves along with a vertical shake as a board does, within 0.1 mm.
+    """
+    if motion != "shake" or holding == "corner":
+        return offset
+    return Rotation.from_rotvec([0.0, SHAKE_TILT_RAD, 0.0]).apply(offset)
 
 
 def _solve_joints(rig: Rig, name: str, pose: Array) -> Array:
