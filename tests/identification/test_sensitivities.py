@@ -143,14 +143,14 @@ def test_where_nothing_can_be_simulated_ahead_secants_go_back(short, monkeypatch
     """A solution just below the stiffness that a given step allows: the search is not lost at its end."""
     model, unknowns, seen = short
     problem = Objective(model, unknowns, [seen], 0.5 * model.stable_step())
-    simulated, steps = problem.observe, 1e-4 * torch.tensor([min(1.0, abs(u.value(u.start))) for u in unknowns])
+    simulated, steps = problem._simulate_cloth, 1e-4 * torch.tensor([min(1.0, abs(u.value(u.start))) for u in unknowns])
 
-    def within(raw):
+    def within(raw, i):
         if not bool((raw <= problem.start).all()) or (open_to == "neither" and not torch.equal(raw, problem.start)):
             raise UnstableStep("dt", got="0.5 s", expected="less")
-        return simulated(raw)
+        return simulated(raw, i)
 
-    monkeypatch.setattr(problem, "observe", within)
+    monkeypatch.setattr(problem, "_simulate_cloth", within)
     exact, (finite, reach) = problem.linearise(problem.start), problem.linearise_by_differences(problem.start, steps)
     missed = (exact.jacobian - finite.jacobian).norm(dim=0) / exact.jacobian.norm(dim=0)
     assert float(missed.max()) < 1e-2

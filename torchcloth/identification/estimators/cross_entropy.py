@@ -15,9 +15,9 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from ...episodes.unknowns import Unknown
 from ...errors import SimulationDiverged, UnstableStep
 from . import levenberg_marquardt
+from .multistart import comparable_costs
 from .objective import Objective
 
 
@@ -27,28 +27,53 @@ class CrossEntropySettings:
 
     Attributes:
         rounds: largest number of rounds.
+        min_rounds: smallest number of rounds.
         draws_per_unknown: fabrics in a round, for each unknown.
         elite_fraction: of the draws around which the next round is drawn.
         widening: of the elite's standard deviation, which selection makes too small.
         start_std: standard deviation of the first round: of the logarithm of what cannot be negative.
         start_std_ratio: the same of any other unknown, over the standard deviation of its prior.
         min_amplitude_ratio: smallest amplitude that is drawn, over its typical size.
-        end_cost_range: the search ends when the costs of the elite differ by no more: slopes find what is left.
+        min_cost_decrease: of the best fabric, below which a round is the last: slopes find what is left.
         points_per_frame: to which clouds are thinned.
     """
 
     rounds: int = 5
+    min_rounds: int = 3
     draws_per_unknown: int = 6
     elite_fraction: float = 0.25
     widening: float = 1.2
     start_std: float = 1.2
     start_std_ratio: float = 0.5
     min_amplitude_ratio: float = 0.05
-    end_cost_range: float = 1.0
+    min_cost_decrease: float = 1.0
     points_per_frame: int = 400
 
 
 CROSS_ENTROPY_SETTINGS = CrossEntropySettings()
+
+
+class Axis(NamedTuple):
+    """One coordinate of the search.
+
+    Attributes:
+        index: of the unknown.
+        std: standard deviation of the first round.
+        least: smallest value of an unknown that is stored as it is and cannot be negative: its logarithm is drawn.
+            None: the unknown itself is drawn.
+    """
+
+    index: int
+    std: float
+    least: float | None = None
+
+    def to_place(self, raw: float) -> float:
+        """Return the coordinate of an unknown."""
+        return raw if self.least is None else math.log(max(raw, self.least))
+
+    def from_place(self, place: float) -> float:
+        """Return the unknown at a coordinate."""
+        return place if self.least is None else math.exp(place)
 
 
 class Draw(NamedTuple):
@@ -82,30 +107,29 @@ def search_by_draws(
         UnstableStep: at the start.
     """
     problem = objective.problem()
-    searched = [(k, u) for k, u in enumerate(objective.unknowns) if not u.measured]
+    axes = _list_axes(objective, settings)
     generator = torch.Generator().manual_seed(0)
-    count = max(2, settings.draws_per_unknown * len(searched))
-    mean = torch.tensor([_to_place(u, float(start[k]), settings) for k, u in searched], dtype=torch.float64)
-    std = torch.tensor([_start_std(u, settings) for _, u in searched], dtype=torch.float64)
+    count = max(2, settings.draws_per_unknown * len(axes))
+    mean = torch.tensor([axis.to_place(float(start[axis.index])) for axis in axes], dtype=torch.float64)
+    std = torch.tensor([axis.std for axis in axes], dtype=torch.float64)
     best = Draw(mean, _fit_observer(objective, start))
-    for _ in range(settings.rounds):
+    for count_before in range(settings.rounds):
         draws = [best]
-        offsets = torch.randn(count - 1, len(searched), generator=generator, dtype=torch.float64)
+        offsets = torch.randn(count - 1, len(axes), generator=generator, dtype=torch.float64)
         for place in [mean, *(mean + std * offset for offset in offsets)]:
             raw = best.at.raw.clone()
-            for (k, u), coordinate in zip(searched, place.tolist(), strict=True):
-                raw[k] = _from_place(u, coordinate)
+            for axis, coordinate in zip(axes, place.tolist(), strict=True):
+                raw[axis.index] = axis.from_place(coordinate)
             try:
                 draws.append(Draw(place, _fit_observer(objective, raw)))
             except (SimulationDiverged, UnstableStep):
                 continue
-        reference = min((draw.at for draw in draws), key=lambda at: float(at.scale.log().sum()))
-        costs = [levenberg_marquardt.robust_cost(problem, reference, d.at.raw, d.at.linear.residual) for d in draws]
+        costs = comparable_costs(problem, [draw.at for draw in draws])
         order = sorted(range(len(draws)), key=costs.__getitem__)[: max(2, round(settings.elite_fraction * count))]
-        best = draws[order[0]]
-        elite = torch.stack([draws[i].place for i in order])
+        best, elite = draws[order[0]], torch.stack([draws[i].place for i in order])
         mean, std = elite.mean(0), settings.widening * elite.std(0)
-        if on_round(best.at.raw) or costs[order[-1]] - costs[order[0]] <= settings.end_cost_range:
+        has_stalled = costs[0] - costs[order[0]] < settings.min_cost_decrease  # the first draw is the best one so far
+        if on_round(best.at.raw) or (has_stalled and count_before + 1 >= settings.min_rounds):
             break
     return best.at.raw
 
@@ -115,21 +139,14 @@ def _fit_observer(objective: Objective, raw: Tensor) -> levenberg_marquardt.Iter
     return levenberg_marquardt.minimise(objective.observer_problem(raw), raw, 1, lambda at: False)
 
 
-def _is_ratio(unknown: Unknown) -> bool:
-    """Whether an unknown is stored as it is and cannot be negative: draws are of its logarithm."""
-    return unknown.parameter.domain == "nonnegative"
-
-
-def _start_std(unknown: Unknown, settings: CrossEntropySettings) -> float:
-    is_scale = unknown.parameter.domain in ("positive", "nonnegative")
-    return settings.start_std if is_scale else settings.start_std_ratio * unknown.prior_std
-
-
-def _to_place(unknown: Unknown, raw: float, settings: CrossEntropySettings) -> float:
-    if not _is_ratio(unknown):
-        return raw
-    return math.log(max(raw, settings.min_amplitude_ratio * unknown.typical_amplitude))
-
-
-def _from_place(unknown: Unknown, place: float) -> float:
-    return unknown.clip(math.exp(place) if _is_ratio(unknown) else place)
+def _list_axes(objective: Objective, settings: CrossEntropySettings) -> list[Axis]:
+    """Return what is searched: the fabric's unknowns that were not measured."""
+    axes = []
+    for k, unknown in enumerate(objective.unknowns):
+        if unknown.measured:
+            continue
+        least = settings.min_amplitude_ratio * unknown.typical_amplitude
+        is_scale = unknown.parameter.domain in ("positive", "nonnegative")
+        std = settings.start_std if is_scale else settings.start_std_ratio * unknown.prior_std
+        axes.append(Axis(k, std, least if unknown.parameter.domain == "nonnegative" else None))
+    return axes

@@ -141,16 +141,13 @@ class FrameTimes:
                 sums = sums.index_add(1, rows.frame, torch.stack([weighted * slope, weighted * rows.residual]))
         return TimeSlopes(*sums)
 
-    def project(
-        self, frames: Frames, derivatives: Frames, scene: Scene, followed_by: int = 0
-    ) -> dict[str, ResidualRows | None]:
+    def project(self, frames: Frames, derivatives: Frames, scene: Scene) -> dict[str, ResidualRows | None]:
         """Compute rows by block name, whose slopes say that the times of the frames follow the unknowns.
 
         Args:
             frames: at the times that count.
             derivatives: of them at these times, with K in front.
             scene: what they are compared with.
-            followed_by: number of unknowns, the first ones, whose derivatives say so already.
         """
         joined = join_derivatives(derivatives, time_derivatives(frames))
         simulated = match_points(frames, joined, scene.episode, scene.surface)
@@ -162,7 +159,6 @@ class FrameTimes:
             weighted = self.noise[name].weights(r.residual) * jacobian[:, -1]
             totals = totals.index_add(0, r.frame, weighted[:, None] * jacobian)
         gain = self.gain(totals[:, -1])[:, None] * totals[:, :-1]
-        gain[:, :followed_by] = 0
         for name, r in rows.items():
             if r is not None:
                 jacobian = _require(r.jacobian)

@@ -50,10 +50,17 @@ def _half_range(unknown: Unknown) -> float:
     return START_RANGE_DECADES * unknown.prior_std
 
 
+def comparable_costs(
+    problem: levenberg_marquardt.Problem, points: Sequence[levenberg_marquardt.Iterate]
+) -> list[float]:
+    """Return the robust costs of points with the same noise scales for all."""
+    reference = min(points, key=lambda at: float(at.scale.log().sum()))  # smallest noise: it explains most
+    return [levenberg_marquardt.robust_cost(problem, reference, at.raw, at.linear.residual) for at in points]
+
+
 def select_best(problem: levenberg_marquardt.Problem, ends: Sequence[levenberg_marquardt.Iterate]) -> MultistartResult:
-    """Return the end point of least robust cost, with the same noise scales for all."""
-    reference = min(ends, key=lambda at: float(at.scale.log().sum()))  # smallest noise: it explains most
-    costs = [levenberg_marquardt.robust_cost(problem, reference, at.raw, at.linear.residual) for at in ends]
+    """Return the end point of least robust cost, and how many others agree with it."""
+    costs = comparable_costs(problem, ends)
     best = ends[costs.index(min(costs))]
     # chaos leaves the covariance singular
     precision = torch.linalg.pinv(levenberg_marquardt.covariance(problem, best), hermitian=True)

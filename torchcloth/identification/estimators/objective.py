@@ -345,8 +345,11 @@ class Objective:
         initial = episode.initial + torch.einsum("k,kvc->vc", values, modes.x)
         return replace(episode, initial=initial, initial_velocity=velocity)
 
-    def _tangents(self, raw: Tensor, i: int, by_fabric: bool = True) -> tuple[Frames, Frames]:
-        """One episode, and its derivatives by all unknowns; those by the fabric's are zero if not ``by_fabric``."""
+    def _differentiate(self, raw: Tensor, i: int, by_fabric: bool = True) -> tuple[Frames, Frames]:
+        """One episode as an observer without errors sees it, and its derivatives by all unknowns, [K, ...].
+
+        Those by errors of the observer are zero, and those by the fabric's unknowns if not ``by_fabric``.
+        """
         (mode_columns, modes), episode = self._first_state_modes(i), self._initial_episode(raw, i)
         (cloth, stretched), fabric = self._gripped_cloth(raw, i), raw[: len(self.unknowns)]
         if stretched is not None:
@@ -360,8 +363,40 @@ class Objective:
             return d.new_zeros(len(raw), *d.shape[1:]).index_copy(0, columns, d)
 
         derivatives = map_frames(computed, spread)
-        self._differentiate_by_grip_extents(raw, i, frames, derivatives)
-        return self._observe_with_derivatives(raw, i, frames, derivatives)
+        self._replace_by_differences(raw, i, frames, derivatives, self._grip_extent_steps(i))
+        return frames, derivatives
+
+    def _grip_extent_steps(self, i: int) -> dict[int, float]:
+        """Steps of finite slopes by how far grippers hold the cloth, by index: their meshes differ."""
+        steps = {}
+        for s in self.nuisance_slices[i]:
+            if isinstance(s.nuisance, GripExtent):
+                indices = range(s.index.start, s.index.stop)
+                steps |= zip(indices, (GRIP_EXTENT_STEP_STDS * std for std in s.stds), strict=True)
+        return steps
+
+    def _replace_by_differences(
+        self, raw: Tensor, i: int, frames: Frames, derivatives: Frames, steps: Mapping[int, float]
+    ) -> None:
+        """Write finite slopes by some unknowns into derivatives [K, ...] of episode ``i``."""
+        for k, size in steps.items():
+            step, there = self._simulate_shifted(raw, i, k, size)
+            if there is None:
+                continue
+            derivatives.x[k], derivatives.v[k] = (there.x - frames.x) / step, (there.v - frames.v) / step
+            for name, wrench in derivatives.wrench.items():
+                wrench[k] = (there.wrench[name] - frames.wrench[name]) / step
+
+    @torch.no_grad()
+    def _simulate_shifted(self, raw: Tensor, i: int, k: int, size: float) -> tuple[float, Frames | None]:
+        """(step of unknown ``k``, frames there), backwards where forwards fails; (0, None) where both fail."""
+        for step in (size, -size):
+            shifted = raw.detach().clone()
+            shifted[k] += step
+            if torch.equal(self.clip(shifted), shifted):
+                with suppress(SimulationDiverged, UnstableStep):
+                    return step, self._simulate_cloth(shifted, i)
+        return 0.0, None
 
     def _observe_with_derivatives(
         self, raw: Tensor, i: int, frames: Frames, derivatives: Frames
@@ -373,30 +408,6 @@ class Objective:
             times, shift = self.episodes[i].times, self.frame_times.find_shifts(frames, self.scene(i))
             frames, derivatives = (see_at(f, times, shift) for f in (frames, derivatives))
         return frames, derivatives
-
-    def _differentiate_by_grip_extents(self, raw: Tensor, i: int, frames: Frames, derivatives: Frames) -> None:
-        """Write finite slopes by how far out grippers hold the cloth into derivatives [K, ...]: meshes differ."""
-        for s in self.nuisance_slices[i]:
-            if not isinstance(s.nuisance, GripExtent):
-                continue
-            for k, std in zip(range(s.index.start, s.index.stop), s.stds, strict=True):
-                step, there = self._simulate_with_other_grip(raw, i, k, GRIP_EXTENT_STEP_STDS * std)
-                if there is None:
-                    continue
-                derivatives.x[k], derivatives.v[k] = (there.x - frames.x) / step, (there.v - frames.v) / step
-                for name, wrench in derivatives.wrench.items():
-                    wrench[k] = (there.wrench[name] - frames.wrench[name]) / step
-
-    @torch.no_grad()
-    def _simulate_with_other_grip(self, raw: Tensor, i: int, k: int, size: float) -> tuple[float, Frames | None]:
-        """(step of unknown ``k``, frames there), backwards where forwards fails; (0, None) where both fail."""
-        for step in (size, -size):
-            shifted = raw.detach().clone()
-            shifted[k] += step
-            if torch.equal(self.clip(shifted), shifted):
-                with suppress(SimulationDiverged, UnstableStep):
-                    return step, self._simulate_cloth(shifted, i)
-        return 0.0, None
 
     # -- residuals ------------------------------------------------------------------------------------------------
 
@@ -419,21 +430,25 @@ class Objective:
         """
         self._count_simulations(raw)
         self.simulations += len(self.unknowns) * len(self.episodes)
-        rows = self._recall("linearise", raw, lambda: self._rows(self._remember_tangents(raw)))
+        rows = self._recall("linearise", raw, lambda: self._observed_rows(raw, self._remember_derivatives(raw)))
         return levenberg_marquardt.Linearised(*rows)
 
-    def _remember_tangents(self, raw: Tensor) -> list[tuple[Frames, Frames]]:
+    def _remember_derivatives(self, raw: Tensor) -> list[tuple[Frames, Frames]]:
         self._last_linearised = None  # two of them would double the memory
-        simulated = [self._tangents(raw, i) for i in range(len(self.episodes))]
+        simulated = [self._differentiate(raw, i) for i in range(len(self.episodes))]
         self._last_linearised = tuple(raw.tolist()), simulated
         return simulated
 
-    def _take_tangents(self, raw: Tensor) -> list[tuple[Frames, Frames]]:
+    def _take_derivatives(self, raw: Tensor) -> list[tuple[Frames, Frames]]:
         """Return all episodes with their derivatives, those of the last linearisation if it was here."""
         last, self._last_linearised = self._last_linearised, None
         if last is not None and last[0] == tuple(raw.tolist()):
             return last[1]
-        return [self._tangents(raw, i) for i in range(len(self.episodes))]
+        return [self._differentiate(raw, i) for i in range(len(self.episodes))]
+
+    def _observed_rows(self, raw: Tensor, simulated: Sequence[tuple[Frames, Frames]]) -> levenberg_marquardt.Linearised:
+        """Rows of what an observer with errors sees of simulated episodes and their derivatives."""
+        return self._rows([self._observe_with_derivatives(raw, i, *pair) for i, pair in enumerate(simulated)])
 
     def observer_problem(self, raw: Tensor) -> levenberg_marquardt.Problem:
         """Return the problem of the observer's errors, of cloth that moves as at ``raw``: one simulation is enough."""
@@ -445,11 +460,8 @@ class Objective:
             simulated = [self._simulate_cloth(raw, i) for i in range(len(self.episodes))]
 
         def linearise(at: Tensor) -> levenberg_marquardt.Linearised:
-            seen = []
-            for i, frames in enumerate(simulated):
-                none = map_frames(frames, lambda x: x.new_zeros(len(raw), *x.shape))
-                seen.append(self._observe_with_derivatives(at, i, frames, none))
-            return levenberg_marquardt.Linearised(*self._rows(seen))
+            none = [map_frames(frames, lambda x: x.new_zeros(len(raw), *x.shape)) for frames in simulated]
+            return self._observed_rows(at, list(zip(simulated, none, strict=True)))
 
         def evaluate(at: Tensor) -> tuple[Tensor, Tensor]:
             rows = self._rows([(self._observe(at, i, frames), None) for i, frames in enumerate(simulated)])
@@ -464,7 +476,9 @@ class Objective:
         self._count_simulations(raw)
         episodes = range(len(self.episodes))
         rows = self._recall(
-            "linearise-first-shape", raw, lambda: self._rows([self._tangents(raw, i, False) for i in episodes])
+            "linearise-first-shape",
+            raw,
+            lambda: self._observed_rows(raw, [self._differentiate(raw, i, by_fabric=False) for i in episodes]),
         )
         return levenberg_marquardt.Linearised(*rows)
 
@@ -544,35 +558,17 @@ class Objective:
         Returns:
             The rows, and how far a unit of each of the fabric's unknowns moves the cloth.
         """
-        simulated = self._take_tangents(raw)
-        for k in range(len(self.unknowns)):
-            step, shifted_frames = self._simulate_shifted(raw, k, float(steps[k]))
-            for (frames, derivatives), shifted in zip(simulated, shifted_frames, strict=bool(step)):
-                derivatives.x[k] = (shifted.x - frames.x) / step
-                for name in derivatives.wrench:
-                    derivatives.wrench[name][k] = (shifted.wrench[name] - frames.wrench[name]) / step
-        count = len(self.unknowns)
+        count, simulated = len(self.unknowns), self._take_derivatives(raw)
+        self.simulations += count * len(self.episodes)
+        for i, (frames, derivatives) in enumerate(simulated):
+            self._replace_by_differences(raw, i, frames, derivatives, dict(enumerate(steps[:count].tolist())))
         position = torch.stack([d.x[:count].square().sum(-1).mean((1, 2)) for _, d in simulated])
         wrenches = [w for _, d in simulated for w in d.wrench.values()]
         forces = [w[:count, 1:, :3].square().sum(-1).mean(1) for w in wrenches]
         force = torch.stack(forces).mean(0) if forces else torch.zeros(count)
-        return self._rows(simulated, followed_by=count), ParameterInfluence(position.mean(0).sqrt(), force.sqrt())
+        return self._observed_rows(raw, simulated), ParameterInfluence(position.mean(0).sqrt(), force.sqrt())
 
-    def _simulate_shifted(self, raw: Tensor, k: int, step: float) -> tuple[float, list[Frames]]:
-        """(step along an unknown, frames there), backwards where forwards fails; (0, []) where both fail."""
-        here, clip = float(raw[k]), self.unknowns[k].clip
-        for signed_step in (clip(here + step) - here, clip(here - step) - here):
-            shifted = raw.clone()
-            shifted[k] += signed_step
-            with suppress(SimulationDiverged, UnstableStep):
-                if signed_step:
-                    return signed_step, self.observe(shifted)
-        return 0.0, []
-
-    def _rows(
-        self, simulated: Sequence[tuple[Frames, Frames | None]], followed_by: int = 0
-    ) -> levenberg_marquardt.Linearised:
-        """Residual rows; slopes by the first ``followed_by`` unknowns already say that times of frames follow them."""
+    def _rows(self, simulated: Sequence[tuple[Frames, Frames | None]]) -> levenberg_marquardt.Linearised:
         parts: list[tuple[int, int, int, ResidualRows]] = []
         first_frame = 0
         scatter = next((n for n in self.nuisances if isinstance(n, RimScatter)), None)
@@ -581,7 +577,7 @@ class Objective:
                 simulated_episode = match_points(frames, derivatives, episode, self.surface)
                 rows_by_block = {block.name: block.rows(simulated_episode) for block in self.blocks}
             else:
-                rows_by_block = self.frame_times.project(frames, derivatives, self.scene(i), followed_by)
+                rows_by_block = self.frame_times.project(frames, derivatives, self.scene(i))
             for b, block in enumerate(self.blocks):
                 rows = rows_by_block[block.name]
                 if rows is not None and block.name == "edges" and scatter is not None:

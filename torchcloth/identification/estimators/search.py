@@ -104,22 +104,19 @@ class Search:
             count: number of starts.
         """
         self._estimate_stamps(start)
-        full, starts = self.objective, None
+        full, starts, origin = self.objective, None, start
+        has_unknown_bench = any(nuisance.acts_on_cloth for nuisance in full.nuisances)
         if count > 1:
             starts = self._search_from_several(start, count, iterations)
             start = starts.raw
         elif early and method == "gauss-newton":
-            if any(nuisance.acts_on_cloth for nuisance in full.nuisances):
-                start = self._search_by_draws(start)
-            else:
-                start = self._fit_early_frames(full.first_fraction(EARLY_FRAME_FRACTION), start, iterations).raw
-        final = self._fit_all_frames(method, start, iterations, rate)
-        for _ in range(MAX_STAMP_ROUNDS):
-            if not self._estimate_stamps(final.raw):
-                break
-            full = self.objective
-            final = self._fit_all_frames(method, final.raw, iterations, rate)
-        checked = linearity.check_linearity(full, final)
+            start = self._fit_roughly(full.first_fraction(EARLY_FRAME_FRACTION), start, iterations)
+            if has_unknown_bench:
+                start = self._fit_roughly(full, start, iterations)
+        checked = self._fit_and_check(method, start, iterations, rate)
+        if early and method == "gauss-newton" and has_unknown_bench and self._is_lost(checked):
+            checked = self._search_again(checked, origin, iterations)
+        full = self.objective
         if checked.is_withdrawn and method not in CHAMFER_METHODS and self.stop != "paper":
             used, checked = self._resolve_unstable(checked, start, iterations)
         else:
@@ -232,6 +229,39 @@ class Search:
             chamfer = self.objective.distance_metrics(at.raw).chamfer
             self.on_progress(len(self.history) - 1, chamfer, self.objective.physical_values(at.raw), 1.0)
         return False
+
+    def _fit_roughly(self, part: Objective, start: Tensor, iterations: int) -> Tensor:
+        """Fit frames as far as is cheap: without nuisances that act on the cloth, whose slopes need simulations."""
+        rough = part.with_nuisances([n for n in part.nuisances if not n.acts_on_cloth])
+        if not rough.has_data:
+            return start
+        full, begin = self.objective, rough.take_unknowns(start, self.objective)
+        end = self._fit_early_frames(rough, begin, iterations).raw
+        self.partial_simulations += rough.simulations
+        return full.take_unknowns(end, rough)
+
+    def _fit_and_check(self, method: str, start: Tensor, iterations: int, rate: float) -> linearity.LinearityCheck:
+        """Fit all frames, again where the stamps scatter otherwise than assumed, and check the slopes at the end."""
+        final = self._fit_all_frames(method, start, iterations, rate)
+        for _ in range(MAX_STAMP_ROUNDS):
+            if not self._estimate_stamps(final.raw):
+                break
+            final = self._fit_all_frames(method, final.raw, iterations, rate)
+        return linearity.check_linearity(self.objective, final)
+
+    def _is_lost(self, checked: linearity.LinearityCheck) -> bool:
+        """Whether slopes led to an end that says nothing."""
+        misfit = points_misfit(self.objective, checked.final) or 0.0
+        has_failed = checked.is_withdrawn or bool(find_misfit(misfit, self.noise_std))
+        return has_failed or not (checked.final.converged or not find_failure_reason(self.objective, checked))
+
+    def _search_again(
+        self, lost: linearity.LinearityCheck, origin: Tensor, iterations: int
+    ) -> linearity.LinearityCheck:
+        """Search from the best of many simulations around a start, and return the better end of the two."""
+        checked = self._fit_and_check("gauss-newton", self._search_by_draws(origin), iterations, 0.0)
+        before, after = multistart.comparable_costs(self.objective.problem(), [lost.final, checked.final])
+        return checked if after < before else lost
 
     def _search_by_draws(self, start: Tensor) -> Tensor:
         """Search by simulations of fabrics alone, with the errors of the observer that are numbers of the search."""
