@@ -245,6 +245,7 @@ def test_what_is_not_used_was_not_seen(scene, use, noise):
         ({"uncertain": {"colour": (1.0, 2.0)}}, "colour"),
         ({"uncertain": {"air.normal": (1.0, -1.0)}}, "air.normal"),
         ({"nuisances": ["weather"]}, "nuisance"),
+        ({"nuisances": ["grip", "jitter"]}, "nuisances; got grip, jitter; expected none of these"),
         ({"use": ["sound"]}, "use"),
         ({"noise": {"colour": 1.0}}, "noise; got 'colour'; expected some of points"),
         ({"noise": {"points": -1.0}}, "noise of points"),

@@ -21,7 +21,15 @@ from ..episodes.observed import TIME_AFTER_KNOT_S, Episode, build_episode, requi
 from ..episodes.unknowns import apply_priors, collect_unknowns
 from ..errors import InvalidInput, RecordingError
 from ..identification.estimators.objective import Objective
-from ..identification.nuisances import FirstStateOffset, add_lookahead, as_stds, implied_nuisances, select_nuisances
+from ..identification.nuisances import (
+    FirstStateOffset,
+    GripExtent,
+    StampJitter,
+    add_lookahead,
+    as_stds,
+    implied_nuisances,
+    select_nuisances,
+)
 from ..identification.residuals.blocks import select_blocks
 from ..identification.residuals.metrics import MIN_NOISE_SCALE, distance_metrics
 from ..identification.residuals.rigid_carry import carry_rigidly
@@ -46,6 +54,7 @@ from .warnings import pose_warnings
 # A depth camera is off by patches, slowly, and the estimate follows it: by a millimetre at a metre at least, and by
 # more than its points scatter: Kinect and calibrated stereo scatter by 2 mm, and are off by some 5 mm.
 SLOW_DEPTH_ERROR_STD_M, SLOW_DEPTH_ERROR_RATIO = 1e-3, 2.0
+IDENTIFY_ONLY_NUISANCES = {GripExtent.name, StampJitter.name}
 INITIAL_FORCE_STD_M_PER_S2 = 0.5  # of the corrective force; its size is then learnt from the recording
 
 Progress = Callable[[str, float], None]
@@ -84,8 +93,8 @@ def estimate_pose(
             errors are part of the result's.
         window: duration in which the force is constant [s].
         modes: number of smooth fields over the fabric for each axis of the force.
-        nuisances: as in ``identify``: "clock", "camera", "grasp", "grasp_turn", "shape", "velocity". Where the cloth
-            moves at the first frame, the last two join, in as many fields as the force has.
+        nuisances: as in ``identify``, without "grip" and "jitter": "clock", "camera", "grasp", "grasp_turn", "shape",
+            "velocity". Where the cloth moves at the first frame, the last two join, in as many fields as the force has.
         use: kinds of data, some of "points", "markers" and "force"; None: all that the recording has.
         noise: least standard deviation by kind of data, as in ``identify``.
         dt: largest substep [s]; None: the stable one.
@@ -112,6 +121,13 @@ def estimate_pose(
     check_recording(recording)
     check_size(recording)
     notes, nuisances = [], as_stds(nuisances)
+    if unknown := sorted(IDENTIFY_ONLY_NUISANCES & nuisances.keys()):
+        raise InvalidInput(
+            "nuisances",
+            got=", ".join(unknown),
+            expected="none of these, which only identify knows",
+            remedy='clock, camera, grasp, grasp_turn and shape say what may be off: "clock" instead of "jitter"',
+        )
     if checks:
         (recording,), notes, clock_std = check_all([recording])
         nuisances = nuisances if clock_std is None else {"clock": clock_std, **nuisances}

@@ -25,7 +25,7 @@ from ..episodes.replay import (
 from ..episodes.unknowns import Unknown, make_state_entries
 from ..errors import InvalidInput, SimulationDiverged
 from ..identification.estimators import levenberg_marquardt
-from ..identification.estimators.objective import Objective, apply_nuisance
+from ..identification.estimators.objective import Objective
 from ..identification.nuisances import AbstractNuisance
 from ..identification.residuals.blocks import Block
 from ..identification.residuals.metrics import distance_metrics
@@ -200,12 +200,9 @@ class CorrectedObjective(Objective):
             state = out.state
             yield out
 
-    def simulate(self, raw: Tensor, i: int) -> Frames:
-        """Simulate the episode as it is observed."""
-        frames = concatenate_windows([frames_from_rollout(out) for out in self.simulate_windows(raw)])
-        for s in self.nuisance_slices[i]:
-            frames = s.nuisance.observe(frames, raw[s.index].to(frames.x), self.episodes[i])
-        return frames
+    def _simulate_cloth(self, raw: Tensor, i: int) -> Frames:
+        """Simulate the episode as an observer without errors sees it."""
+        return concatenate_windows([frames_from_rollout(out) for out in self.simulate_windows(raw)])
 
     def last_state(self, raw: Tensor) -> ClothState:
         """Simulate up to the last observed frame and return the state there."""
@@ -214,17 +211,14 @@ class CorrectedObjective(Objective):
 
     def simulate_with_tangents(self, raw: Tensor) -> tuple[Frames, Frames]:
         """Simulate the episode as it is observed, with derivatives by all unknowns; the last answer is remembered."""
-        return self._tangents(raw, 0)
+        return self._observe_with_derivatives(raw, 0, *self._differentiate(raw, 0))
 
-    def _tangents(self, raw: Tensor, i: int) -> tuple[Frames, Frames]:
+    def _differentiate(self, raw: Tensor, i: int, by_fabric: bool = True) -> tuple[Frames, Frames]:
         if self._last_tangents is None or not torch.equal(self._last_tangents[0], raw):
-            frames, derivatives = self._tangents_without_nuisances(raw, i)
-            for s in self.nuisance_slices[i]:
-                frames, derivatives = apply_nuisance(s, frames, derivatives, raw, self.episodes[i])
-            self._last_tangents = raw.clone(), frames, derivatives
+            self._last_tangents = raw.clone(), *self._simulate_with_tangents(raw, i)
         return self._last_tangents[1], self._last_tangents[2]
 
-    def _tangents_without_nuisances(self, raw: Tensor, i: int) -> tuple[Frames, Frames]:
+    def _simulate_with_tangents(self, raw: Tensor, i: int) -> tuple[Frames, Frames]:
         """The episode and its derivatives by all unknowns; a later force does not move an earlier window."""
         (mode_columns, modes), episode = self._first_state_modes(i), self._initial_episode(raw, i)
         count, per_window = len(self.unknowns), self.force.count_per_window
