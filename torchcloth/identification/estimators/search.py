@@ -105,16 +105,15 @@ class Search:
         """
         self._estimate_stamps(start)
         full, starts, origin = self.objective, None, start
-        has_unknown_bench = any(nuisance.acts_on_cloth for nuisance in full.nuisances)
         if count > 1:
             starts = self._search_from_several(start, count, iterations)
             start = starts.raw
         elif early and method == "gauss-newton":
             start = self._fit_roughly(full.first_fraction(EARLY_FRAME_FRACTION), start, iterations)
-            if has_unknown_bench:
+            if _has_unknown_bench(full):
                 start = self._fit_roughly(full, start, iterations)
         checked = self._fit_and_check(method, start, iterations, rate)
-        if early and method == "gauss-newton" and has_unknown_bench and self._is_lost(checked):
+        if early and method == "gauss-newton" and _has_unknown_bench(full) and self._is_lost(checked):
             checked = self._search_again(checked, origin, iterations)
         full = self.objective
         if checked.is_withdrawn and method not in CHAMFER_METHODS and self.stop != "paper":
@@ -152,8 +151,12 @@ class Search:
         """Where tangents fail: fit the predictable beginning, then the rest by simulations spread around it."""
         full = self.objective
         beginning = predictability.fit_predictable_part(full, failed, start, self._append_iterate)
-        if beginning is not None and not self._undecided_parameters(beginning.objective, beginning.checked):
-            return beginning.objective, beginning.checked
+        if beginning is not None:
+            undecided = self._undecided_parameters(beginning.objective, beginning.checked)
+            fitted = [u.name for u in full.unknowns if not u.measured]
+            # a round of simulations costs two for each unknown, and a bench has dozens
+            if not undecided or (_has_unknown_bench(full) and len(undecided) < len(fitted)):
+                return beginning.objective, beginning.checked
 
         def on_round(raw: Tensor) -> bool:
             return self.append_history(raw, full)
@@ -304,3 +307,8 @@ class Search:
             return "gradient descent has no test of convergence"
         done = len(self.history) - 1
         return f"stopped after {done} iterations before converging"
+
+
+def _has_unknown_bench(objective: Objective) -> bool:
+    """Whether there are unknown errors of a bench that act on the cloth."""
+    return any(nuisance.acts_on_cloth for nuisance in objective.nuisances)
