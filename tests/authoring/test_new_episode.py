@@ -1,6 +1,8 @@
 """Episodes from the files of a bench are those that the files were made from."""
 
 import json
+import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -13,6 +15,8 @@ from torchcloth.cli import main
 from torchcloth.episodes.pattern_interpolation import interpolate_on_pattern, interpolation_weights
 from torchcloth.losses import find_closest_points
 from torchcloth.meshes import Mesh
+from torchcloth.observe import CameraPose
+from torchcloth.recordings.formats.calibration_files import read_pose
 
 MAX_POINT_ERROR_M = 2e-3  # rms: noise of 1 mm, images in mm
 MAX_CORNER_ERROR_M = 0.012  # a pixel at 1 m
@@ -148,3 +152,28 @@ def test_a_camera_that_sees_nothing_at_the_gripper_is_refused(bar, tmp_path, cap
 def test_two_arms_need_two_joint_logs_or_one_for_both(two_arms, tmp_path, capsys):
     assert main(["new", str(tmp_path / "episode"), *two_arms.options, "--tool", "flange", "--tool", "flange"]) == 2
     assert "number of --tool" in one_line(capsys.readouterr().err)
+
+
+def without_option(options: list[str], option: str) -> list[str]:
+    """Return the options without one of them and its value."""
+    i = options.index(option)
+    return [*options[:i], *options[i + 2 :]]
+
+
+def test_a_camera_that_nobody_calibrated_is_found_from_the_arm(bar, tmp_path, capsys, monkeypatch):
+    """Here the sheet hides half of the arm, and ``test_camera_from_arm.py`` tests the estimate in full view."""
+    true_pose = read_pose(Path(bar.options[bar.options.index("--camera-pose") + 1]))
+    pose = CameraPose(true_pose, 1e-6 * np.eye(6), np.zeros(0), np.zeros(0), 1.0, 1e-3, 5000, 0.9)
+    module = sys.modules["torchcloth.authoring.new_episode"]  # the package has a function of this name
+    monkeypatch.setattr(module, "find_camera_pose_from_arms", lambda recording, name: pose)
+    assert main(["new", str(tmp_path / "episode"), *without_option(bar.options, "--camera-pose")]) == 0
+    assert "camera: pose from the arm, to 1.7 mm and 0.10 degrees (else give --camera-pose)" in capsys.readouterr().out
+    np.testing.assert_array_equal(recordings.read(tmp_path / "episode").cameras["cam0"].T_world_camera, true_pose)
+
+
+def test_where_images_have_another_clock_the_pose_is_asked_for(two_arms, tmp_path, capsys):
+    assert main(["new", str(tmp_path / "episode"), *without_option(two_arms.options, "--camera-pose")]) == 2
+    said = capsys.readouterr().err
+    assert "another clock than the joints" in said
+    assert "--camera-pose" in said
+    assert not (tmp_path / "episode").exists()

@@ -53,7 +53,7 @@ class CameraFiles:
     Attributes:
         depth: folder of 16-bit PNG files.
         intrinsics: JSON file of the camera matrix.
-        pose: text file of the camera's pose in the world.
+        pose: text file of the camera's pose in the world; None: found from the arm in view.
         times: table with a time of each image; None: found beside them, or in their names.
         fps: images per second, if nothing gives their times.
         depth_scale: m per unit of the images; None: as the intrinsics say, or millimetres.
@@ -62,7 +62,7 @@ class CameraFiles:
 
     depth: str | Path
     intrinsics: str | Path
-    pose: str | Path
+    pose: str | Path | None = None
     times: str | Path | None = None
     fps: float | None = None
     depth_scale: float | None = None
@@ -168,7 +168,7 @@ def read_camera(files: CameraFiles, time_unit: TimeUnit | None) -> tuple[BenchCa
         width=size[0],
         height=size[1],
         K=calibration["K"],
-        T_world_camera=read_pose(Path(files.pose)),
+        T_world_camera=np.eye(4) if files.pose is None else read_pose(Path(files.pose)),
         distortion=calibration.get("distortion", np.zeros(0)),
         depth_scale=scale,
         depth=stream,

@@ -11,6 +11,7 @@ import numpy as np
 
 from ..episodes.recorded_cloth import DEFAULT_MEMBRANE_STIFFNESS_N_PER_M, DEFAULT_POISSON_RATIO, build_cloth
 from ..errors import InvalidInput
+from ..inspection.camera_from_arm import describe_pose_errors, find_camera_pose_from_arms
 from ..pose import PoseEstimator, estimate_first_shape
 from ..recordings import ClothInfo, JointMotion, Recording, RobotInfo, write
 from ..recordings.formats.imported import to_seconds
@@ -108,6 +109,9 @@ def new_episode(
     recording, is_one_clock = _assemble(bench, seen, cloth, grips)
     recording = replace(recording, split={} if motion is None else {"motion": motion}, provenance=provenance)
     notes += camera_notes
+    if camera.pose is None:
+        recording, pose_note = _find_camera_pose(recording, is_one_clock)
+        notes.append(pose_note)
     reach = {name: farthest_corner(sheet, grip.place) for name, grip in grips.items()}
     recording, paths, view_notes = _set_camera_and_clock(recording, reach, is_one_clock)
     cutter = ClothCutter(recording, {name: one.arm for name, one in bench.items()}, reach)
@@ -184,6 +188,22 @@ def _assemble(
         air_density=ROOM_AIR_DENSITY_KG_PER_M3,
     )
     return recording, is_one_clock
+
+
+def _find_camera_pose(recording: Recording, is_one_clock: bool) -> tuple[Recording, str]:
+    """Return the recording with the camera's pose from the arms in its view, and a note on its error."""
+    remedy = "give --camera-pose"
+    if not is_one_clock:
+        got = "no pose, and images on another clock than the joints"
+        raise InvalidInput("camera", got=got, expected="images at known postures, which show the pose", remedy=remedy)
+    pose = find_camera_pose_from_arms(recording, CAMERA_NAME)
+    if not pose.is_determined:
+        raise InvalidInput(
+            "camera", got="no pose, and images that do not show it", expected="the arm in view", remedy=remedy
+        )
+    camera = replace(recording.cameras[CAMERA_NAME], T_world_camera=pose.T_world_camera)
+    note = f"camera: {describe_pose_errors(pose)} (else {remedy})"
+    return replace(recording, cameras={CAMERA_NAME: camera}), note
 
 
 def _set_camera_and_clock(

@@ -45,13 +45,6 @@ def add(verbs: Any) -> None:
         "--intrinsics", required=True, type=Path, metavar="JSON", help="fx, fy, cx, cy, a 3 x 3 matrix, or a CameraInfo"
     )
     required.add_argument(
-        "--camera-pose",
-        required=True,
-        type=Path,
-        metavar="TXT",
-        help="camera to world: 4 x 4 numbers, or x y z qx qy qz qw",
-    )
-    required.add_argument(
         "--sheet",
         nargs=2,
         type=float,
@@ -77,6 +70,12 @@ def add(verbs: Any) -> None:
 
 
 def _add_further_options(new: argparse.ArgumentParser) -> None:
+    new.add_argument(
+        "--camera-pose",
+        type=Path,
+        metavar="TXT",
+        help="camera to world: 4 x 4 numbers, or x y z qx qy qz qw (default: found from the arm in view)",
+    )
     new.add_argument(
         "--base",
         action="append",

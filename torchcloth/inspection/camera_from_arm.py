@@ -65,8 +65,7 @@ def find_camera_pose_from_arms(
 
 def describe_camera_pose(pose: CameraPose, recorded: Array | None) -> str:
     """Return a sentence with a pose from the arm, its standard errors, and how far a recorded pose [4, 4] lies off."""
-    position, turn = 1e3 * np.linalg.norm(pose.position_std), np.rad2deg(np.linalg.norm(pose.rotation_std))
-    text = f"pose from the arm, to {position:.1f} mm and {turn:.2f} degrees"
+    text = describe_pose_errors(pose)
     if recorded is not None:
         off = pose.compare(recorded)
         p_value = chi2.sf(off @ np.linalg.solve(pose.covariance, off), len(off))
@@ -75,6 +74,12 @@ def describe_camera_pose(pose: CameraPose, recorded: Array | None) -> str:
         text += f"{np.rad2deg(np.linalg.norm(off[3:])):.2f} degrees off, {verdict}"
     text += f"; T_world_camera {np.round(pose.T_world_camera, 4).tolist()}"
     return text if pose.is_determined else f"the images do not determine the {text}"
+
+
+def describe_pose_errors(pose: CameraPose) -> str:
+    """Return a phrase with the standard errors of a pose from the arm."""
+    position, turn = 1e3 * np.linalg.norm(pose.position_std), np.rad2deg(np.linalg.norm(pose.rotation_std))
+    return f"pose from the arm, to {position:.1f} mm and {turn:.2f} degrees"
 
 
 def make_arm_function(
