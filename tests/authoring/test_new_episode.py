@@ -1,7 +1,7 @@
 """Episodes from the files of a bench are those that the files were made from."""
 
+import importlib
 import json
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -164,7 +164,7 @@ def test_a_camera_that_nobody_calibrated_is_found_from_the_arm(bar, tmp_path, ca
     """Here the sheet hides half of the arm, and ``test_camera_from_arm.py`` tests the estimate in full view."""
     true_pose = read_pose(Path(bar.options[bar.options.index("--camera-pose") + 1]))
     pose = CameraPose(true_pose, 1e-6 * np.eye(6), np.zeros(0), np.zeros(0), 1.0, 1e-3, 5000, 0.9)
-    module = sys.modules["torchcloth.authoring.new_episode"]  # the package has a function of this name
+    module = importlib.import_module("torchcloth.authoring.new_episode")  # the package has a function of this name
     monkeypatch.setattr(module, "find_camera_pose_from_arms", lambda recording, name: pose)
     assert main(["new", str(tmp_path / "episode"), *without_option(bar.options, "--camera-pose")]) == 0
     assert "camera: pose from the arm, to 1.7 mm and 0.10 degrees (else give --camera-pose)" in capsys.readouterr().out
