@@ -10,11 +10,24 @@ from helpers import sheet_episodes
 from torchcloth import diagnosis as dx
 from torchcloth import recordings as rec
 from torchcloth.boundaries import Grasp
+from torchcloth.cloth import Cloth
 from torchcloth.diagnosis.data.dataset import prepare_data
-from torchcloth.episodes.grip_patch_mesh import move_grip_patches
+from torchcloth.episodes.grip_patch_mesh import (
+    MAX_GROWTH_RADII,
+    MAX_SHRINKAGE_RADII,
+    grip_extent_range,
+    grip_patches,
+    move_grip_patches,
+    stretch_around_grips,
+)
 from torchcloth.episodes.observed import build_episode
+from torchcloth.episodes.pattern_interpolation import move_vertices_to_patches
 from torchcloth.episodes.replay import Frames
 from torchcloth.errors import InvalidInput
+from torchcloth.identification.uncertainty.richardson import refine_cloth
+from torchcloth.materials import AEP
+from torchcloth.meshes import rectangle
+from torchcloth.meshes.patches import Patch
 
 RADIUS = 0.051  # m, of sheets.py: 1.5 edges of the mesh
 
@@ -110,3 +123,20 @@ def test_grips_without_a_place_and_patterns_without_room(made):
         move_grip_patches(world, along=0.15)
     with pytest.raises(InvalidInput, match=r"without a place.*given by uv"):
         Grasp([0, 1]).shifted(0.01, 0.0)
+
+
+def test_a_finer_mesh_has_room_for_the_same_grips():
+    """Two grips of 12 mm together, and each alone; small triangles beside a wider patch do not fold."""
+    uv = {"left": [0.0, 0.3], "right": [0.3, 0.3]}
+    mesh = move_vertices_to_patches(
+        rectangle(0.3, 0.3, resolution=(13, 13)), [Patch(np.array([p]), 0.012) for p in uv.values()]
+    )
+    grasps = {name: Grasp(uv=[place], radius=0.012) for name, place in uv.items()}
+    cloth = Cloth(mesh, AEP(youngs_modulus=3e5, thickness=1e-3), areal_density=0.2, boundaries=grasps)
+    ends = (-MAX_SHRINKAGE_RADII, MAX_GROWTH_RADII)
+    for one in (cloth, refine_cloth(cloth)):
+        assert grip_extent_range(one) == pytest.approx(ends)
+        for name, patch in grip_patches(one).items():
+            for end in ends:
+                stretched = stretch_around_grips(one, {name: end * patch.radius}).cloth
+                assert stretched.mesh.area.min() > 0.05 * one.mesh.area.min()

@@ -29,9 +29,10 @@ from .world import World, rebuild_cloth
 
 MAX_REMEMBERED_CLOTHS = 8  # that are gripped otherwise
 TAPER_RADII = 1.0  # distance over which the pattern around a patch gives way, in radii; farther out meshes differ more
+MIN_TAPER_RATIO = 1.5  # of this distance to that by which the patch's edge moves outwards, or small triangles fold
 MAX_SHRINKAGE_RADII, MAX_GROWTH_RADII = 0.7, 1.5  # of a patch; smaller ones need ever shorter steps
 TRIED_FRACTIONS = tuple(0.1 * k for k in range(10, 0, -1))  # of these
-MIN_TRIANGLE_AREA_RATIO = 0.1  # of a stretched triangle to the original one
+MIN_TRIANGLE_AREA_RATIO = 0.08  # of a stretched triangle to the original one
 
 
 class StretchedCloth(NamedTuple):
@@ -180,7 +181,8 @@ def _stretch_pattern(mesh: Mesh, patches: Mapping[str, Patch], wider: Mapping[st
         radius, offset = patch.radius, patch.offset_from_centre(uv)
         gaps = [_gap_between(patch, other) for other_name, other in patches.items() if other_name != name]
         distance = np.linalg.norm(offset, axis=1)
-        weight = np.clip(1 - (distance - radius) / min([TAPER_RADII * radius, *gaps]), 0.0, 1.0)[:, None]
+        taper = max(TAPER_RADII * radius, MIN_TAPER_RATIO * wider.get(name, 0.0))
+        weight = np.clip(1 - (distance - radius) / min([taper, *gaps]), 0.0, 1.0)[:, None]
         outwards = offset / np.maximum(distance, radius)[:, None]
         sideways = np.stack([np.minimum(to_end / radius, 1.0), np.zeros(len(uv))], 1)
         displacement += weight * (wider.get(name, 0.0) * outwards + along * sideways)
