@@ -13,7 +13,7 @@ import torch
 from torch import Tensor, nn
 
 from ._utils.torch_modes import disable_autocast
-from .boundaries import AbstractBoundary
+from .boundaries import AbstractBoundary, PrescribedMotion
 from .dynamics import substep
 from .dynamics.contact import Contact, Grid
 from .dynamics.elasticity import MATERIAL_MEMORY_KEY, inverse_rest_deformation
@@ -302,7 +302,10 @@ class Cloth(nn.Module):
 
     @disable_autocast()
     def stable_step(self) -> float:
-        """Compute the default substep [s] from the stiffest element and the present parameters."""
+        """Compute the default substep [s] from the stiffest element and the present parameters.
+
+        Motions may take longer ones: what grippers hold all the time does not vibrate.
+        """
         return self._model_and_step()[1]
 
     def build_model(self) -> Model:
@@ -340,7 +343,7 @@ class Cloth(nn.Module):
         """Check the arguments of ``forward``, and return the schedule that it runs."""
         frames = check_times(times)
         motion = check_motions(motion, self.boundaries, frames, self._area)
-        model, limit = self._model_and_step(dt)
+        model, limit = self._model_and_step(dt, self._find_gripped_corners(motion))
         check_substeps(frames[-1] - frames[0], limit, dt)
         counts = [max(1, int(np.ceil((end - start) / limit - 1e-9))) for start, end in pairwise(frames)]
         return self._build_schedule(model, state, motion, frames, counts, dt=dt)
@@ -351,7 +354,7 @@ class Cloth(nn.Module):
         """Check the arguments of ``settle``, and return the schedule that it runs."""
         frames = [start, start + duration]
         motion = check_motions(stationary_motion(motion, *frames), self.boundaries, frames, self._area)
-        model, step = self._model_and_step()
+        model, step = self._model_and_step(is_gripped=self._find_gripped_corners(motion))
         check_rate(rate)
         check_substeps(duration, 1 / (1 / step + rate))
         count = int(np.ceil(duration * (1 / step + rate)))
@@ -378,13 +381,27 @@ class Cloth(nn.Module):
     def _named_effects(self) -> Iterable[tuple[str, AbstractEffect]]:
         return cast("Iterable[tuple[str, AbstractEffect]]", self.effects.items())
 
-    def _model_and_step(self, dt: float | None = None) -> tuple[Model, float]:
-        """Return the model with the stages that the step needs, and the step [s]: the stable one, or the user's."""
+    def _model_and_step(self, dt: float | None = None, is_gripped: Tensor | None = None) -> tuple[Model, float]:
+        """Return the model with the stages that the step needs, and the step [s]: the stable one, or the user's.
+
+        Corners of triangles that are gripped, [E, 3], shorten no step; None: none is.
+        """
         check_parameters(self)
         model = self.build_model()
-        limits = stability_limits(model, self._gradient)
+        limits = stability_limits(model, self._gradient, is_gripped=is_gripped)
         step = check_step(dt, limits.cheapest_step)
         return model._replace(stages=limits.stages_for(step)), step
+
+    def _find_gripped_corners(self, motion: Mapping[str, Trajectory]) -> Tensor:
+        """Return which corners of the triangles, [E, 3], are gripped during the whole motion."""
+        is_gripped = torch.zeros(len(self.mesh.vertices), dtype=torch.bool, device=self._corners.device)
+        for name, boundary in self.boundaries.items():
+            if name in motion and bool(motion[name].closed.all()):
+                closed = PrescribedMotion(motion[name].pose, motion[name].pose, (True,))
+                index = cast("AbstractBoundary", boundary).prescribed_vertices(closed, 0)
+                if index is not None:
+                    is_gripped[index] = True
+        return is_gripped[self._corners].view(3, -1).T
 
     def _build_schedule(
         self,
@@ -405,7 +422,7 @@ class Cloth(nn.Module):
         choice, step_for, requested_frames = self._choose_engine(model, state, min(steps, default=None)), None, None
         if MATERIAL_MEMORY_KEY in state.memory:
             frames, counts, requested_frames = subdivide_intervals(frames, counts)
-            step_for = self._step_for(model, dt)
+            step_for = self._step_for(model, motion, dt)
         graphs = GraphedRollout(model, sum(counts)) if choice.uses_cuda_graphs else None
         schedule = RolloutSchedule(
             model, motion, frames, counts, state, choice, max_extent, step_for, requested_frames, graphs
@@ -413,11 +430,14 @@ class Cloth(nn.Module):
         schedule.check_extent(state)
         return schedule
 
-    def _step_for(self, model: Model, dt: float | None) -> Callable[[ClothState], float]:
+    def _step_for(
+        self, model: Model, motion: Mapping[str, Trajectory], dt: float | None
+    ) -> Callable[[ClothState], float]:
         """Return a function that gives the longest substep [s] for a state, which plastic set shortens."""
 
         def longest_step(state: ClothState) -> float:
-            limits = stability_limits(model, self._gradient, state.memory[MATERIAL_MEMORY_KEY].detach())
+            plastic = state.memory[MATERIAL_MEMORY_KEY].detach()
+            limits = stability_limits(model, self._gradient, plastic, self._find_gripped_corners(motion))
             return check_step(dt, limits.stable_step(model.stages))
 
         return longest_step

@@ -79,7 +79,9 @@ def check_precision(dtype: torch.dtype) -> None:
 
 
 @torch.no_grad()
-def stability_limits(model: Model, gradient: Tensor, inverse_plastic: Tensor | None = None) -> StabilityLimits:
+def stability_limits(
+    model: Model, gradient: Tensor, inverse_plastic: Tensor | None = None, is_gripped: Tensor | None = None
+) -> StabilityLimits:
     """Compute the stability limits of a cloth with all its parts.
 
     The frequency of the mesh is cached per mesh, with all numbers that it depends on.
@@ -89,6 +91,8 @@ def stability_limits(model: Model, gradient: Tensor, inverse_plastic: Tensor | N
         gradient: [E, 3, 2] 1/m, gradients of the shape functions of the pattern.
         inverse_plastic: [..., E, 4], inverse of the plastic set by rows. Triangles that are crushed are small, and
             their step is short.
+        is_gripped: [E, 3] bool, corners that a gripper holds during the whole motion. They do not vibrate, and shorten
+            no step unless layers touch, grips yield, or all are gripped. None: none.
 
     Raises:
         InvalidInput: a precision in which a substep vanishes in rounding, or a vertex without mass.
@@ -107,11 +111,15 @@ def stability_limits(model: Model, gradient: Tensor, inverse_plastic: Tensor | N
     stiffness = Stiffness(*(t.to(gradient) for t in model.material.stiffness(model.coefficients)))  # may be float64
     inverse_rest = model.inverse_rest_deformation
     numbers = (*stiffness, model.areal_density, *([] if inverse_rest is None else [inverse_rest]))
-    dependencies = (spacing, *((t.dtype, t.detach().tolist()) for t in numbers))
+    if spacing is not None or compliance > 0 or (is_gripped is not None and bool(is_gripped.all())):
+        is_gripped = None
+    grips = None if is_gripped is None else is_gripped.tolist()
+    dependencies = (spacing, grips, *((t.dtype, t.detach().tolist()) for t in numbers))
 
     def compute() -> float:
         shape = gradient if inverse_rest is None else rest_shape_gradient(gradient, inverse_rest)
         shape = shape if inverse_plastic is None else shape @ inverse_plastic.unflatten(-1, (2, 2))
+        shape = shape if is_gripped is None else shape.masked_fill(is_gripped.unsqueeze(-1), 0.0)
         try:
             return bound_squared_frequency(shape, model.areal_density, stiffness, spacing)
         except torch.linalg.LinAlgError as error:  # pyright: ignore[reportPrivateImportUsage] - not finite, or its square

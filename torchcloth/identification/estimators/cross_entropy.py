@@ -38,12 +38,12 @@ class CrossEntropySettings:
         points_per_frame: to which clouds are thinned.
     """
 
-    rounds: int = 4
+    rounds: int = 5
     min_rounds: int = 3
-    draws_per_unknown: int = 5
+    draws_per_unknown: int = 6
     elite_fraction: float = 0.25
     widening: float = 1.2
-    start_std: float = 1.0
+    start_std: float = 1.2
     start_std_ratio: float = 0.5
     min_amplitude_ratio: float = 0.05
     min_cost_decrease: float = 1.0

@@ -113,7 +113,7 @@ class Search:
             if _has_unknown_bench(full):
                 start = self._fit_roughly(full, start, iterations)
         checked = self._fit_and_check(method, start, iterations, rate)
-        if early and method == "gauss-newton" and _has_unknown_bench(full) and self._is_lost(checked):
+        if early and method == "gauss-newton" and _has_unknown_bench(full) and self._has_failed(checked):
             checked = self._search_again(checked, origin, iterations)
         full = self.objective
         if checked.is_withdrawn and method not in CHAMFER_METHODS and self.stop != "paper":
@@ -252,19 +252,19 @@ class Search:
             final = self._fit_all_frames(method, final.raw, iterations, rate)
         return linearity.check_linearity(self.objective, final)
 
-    def _is_lost(self, checked: linearity.LinearityCheck) -> bool:
+    def _has_failed(self, checked: linearity.LinearityCheck) -> bool:
         """Whether slopes led to an end that says nothing."""
         misfit = points_misfit(self.objective, checked.final) or 0.0
         has_failed = checked.is_withdrawn or bool(find_misfit(misfit, self.noise_std))
         return has_failed or not (checked.final.converged or not find_failure_reason(self.objective, checked))
 
     def _search_again(
-        self, lost: linearity.LinearityCheck, origin: Tensor, iterations: int
+        self, first: linearity.LinearityCheck, origin: Tensor, iterations: int
     ) -> linearity.LinearityCheck:
         """Search from the best of many simulations around a start, and return the better end of the two."""
         checked = self._fit_and_check("gauss-newton", self._search_by_draws(origin), iterations, 0.0)
-        before, after = multistart.comparable_costs(self.objective.problem(), [lost.final, checked.final])
-        return checked if after < before else lost
+        before, after = multistart.comparable_costs(self.objective.problem(), [first.final, checked.final])
+        return checked if after < before else first
 
     def _search_by_draws(self, start: Tensor) -> Tensor:
         """Search by simulations of fabrics alone, with the errors of the observer that are numbers of the search."""
