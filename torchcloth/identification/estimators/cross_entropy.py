@@ -1,8 +1,9 @@
-"""The first search for the fabric, by simulations alone.
+"""A search for the fabric by simulations alone, where slopes lead astray.
 
 At a bench whose errors are unknown the cost has many hollows, and slopes lead into the nearest one. The cross-entropy
 method (Rubinstein 1999) draws fabrics, keeps the best of them, and draws anew around these. Errors of the observer,
-which need no simulation, are fitted to each draw. Errors that act on the cloth wait for the search by slopes.
+which need no simulation, are fitted to each draw. Errors that act on the cloth wait for the search by slopes that
+follows.
 """
 
 from __future__ import annotations
@@ -113,7 +114,7 @@ def search_by_draws(
     mean = torch.tensor([axis.to_place(float(start[axis.index])) for axis in axes], dtype=torch.float64)
     std = torch.tensor([axis.std for axis in axes], dtype=torch.float64)
     best = Draw(mean, _fit_observer(objective, start))
-    for count_before in range(settings.rounds):
+    for round_index in range(settings.rounds):
         draws = [best]
         offsets = torch.randn(count - 1, len(axes), generator=generator, dtype=torch.float64)
         for place in [mean, *(mean + std * offset for offset in offsets)]:
@@ -129,7 +130,7 @@ def search_by_draws(
         best, elite = draws[order[0]], torch.stack([draws[i].place for i in order])
         mean, std = elite.mean(0), settings.widening * elite.std(0)
         has_stalled = costs[0] - costs[order[0]] < settings.min_cost_decrease  # the first draw is the best one so far
-        if on_round(best.at.raw) or (has_stalled and count_before + 1 >= settings.min_rounds):
+        if on_round(best.at.raw) or (has_stalled and round_index + 1 >= settings.min_rounds):
             break
     return best.at.raw
 

@@ -103,8 +103,9 @@ class Objective:
         return self._with_episodes(add_lookahead(episodes, self.nuisances), self.nuisances)
 
     def with_thinned_clouds(self, points_per_frame: int) -> Objective:
-        """Return the objective of clouds with about as many points, evenly taken."""
-        return self._with_episodes([e.with_thinned_clouds(points_per_frame) for e in self.episodes], self.nuisances)
+        """Return the objective of clouds with about as many points, evenly taken; it has no journal."""
+        thinned = [e.with_thinned_clouds(points_per_frame) for e in self.episodes]
+        return self._copy(self.cloth, thinned, self.nuisances)
 
     def with_nuisances(self, nuisances: Sequence[AbstractNuisance]) -> Objective:
         """Return the objective with other nuisances."""
