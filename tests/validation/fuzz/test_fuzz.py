@@ -105,6 +105,7 @@ PLANTED = {  # format: (what is broken: owner, name, replacement; the input that
     "rosbag1": (checks, "normalise_unit", double, same),
     "tum": (checks, "check_transform", lambda matrix, place: 2 * matrix, same),
     "pcd": (checks, "normalise_unit", double, same),
+    "bench": (checks, "check_transform", lambda matrix, place: 2 * matrix, same),
     "tension": (
         "torchcloth.recordings.tension.ForceDisplacement",
         "strain",
@@ -125,6 +126,7 @@ READERS = {  # the function that reads the bytes of a format
     "rosbag1": (formats.ROS2_IMPORTER.read.__globals__["embedded"], "restore_files"),
     "tum": ("torchcloth.recordings.formats.tum", "_list"),
     "pcd": ("torchcloth.recordings.formats.pcd_file", "_read_entries"),
+    "bench": ("torchcloth.recordings.formats.tables", "_split"),
     "tension": ("torchcloth.recordings.tension", "_columns"),
     "checkpoint": ("torchcloth.training.fit.module", "read_checkpoint"),
 }

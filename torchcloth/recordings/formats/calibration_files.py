@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import re
 from pathlib import Path
 from typing import Any
@@ -19,7 +20,7 @@ DISTORTION_KEYS = ("D", "d", "distortion", "distortion_coefficients", "dist", "d
 MODEL_KEYS = ("distortion_model", "model")
 WIDTH_KEYS, HEIGHT_KEYS = ("width", "image_width", "w"), ("height", "image_height", "h")
 FOCAL_KEYS = (("fx", "fy", "cx", "cy"), ("fx", "fy", "ppx", "ppy"))
-DEPTH_SCALE_KEY = "depth_scale"
+DEPTH_SCALE_KEY, MIN_DEPTH_SCALE_M = "depth_scale", 1e-9
 CAMERA_MATRIX_FORMS = '"fx", "fy", "cx", "cy"; or "K" as 3 rows or 9 numbers; or a CameraInfo of ROS'
 
 
@@ -48,7 +49,8 @@ def read_intrinsics(path: Path) -> dict[str, Any]:
     for key, names in (("width", WIDTH_KEYS), ("height", HEIGHT_KEYS)):
         number = _first(values, names)
         if number is not None:
-            if isinstance(number, bool) or not isinstance(number, int | float) or number != int(number) or number < 1:
+            is_number = isinstance(number, int | float) and not isinstance(number, bool)
+            if not (is_number and 1 <= number < math.inf and number == int(number)):
                 raise RecordingError(f"{path}: {key}", got=number, expected="a whole number of pixels")
             known[key] = int(number)
     distortion = _data(_first(values, DISTORTION_KEYS))
@@ -62,7 +64,12 @@ def read_intrinsics(path: Path) -> dict[str, Any]:
             raise RecordingError(f"{path} has another lens model", got=repr(model), remedy="rectify the images")
         known["distortion"] = coefficients
     scale = values.get(DEPTH_SCALE_KEY)
-    if isinstance(scale, int | float) and not isinstance(scale, bool) and scale > 0:
+    if scale is not None:
+        is_number = isinstance(scale, int | float) and not isinstance(scale, bool)
+        if not (is_number and MIN_DEPTH_SCALE_M < scale < 1 / MIN_DEPTH_SCALE_M):
+            raise RecordingError(
+                f"{path}: {DEPTH_SCALE_KEY}", got=scale, expected="metres per unit, or units per metre"
+            )
         known[DEPTH_SCALE_KEY] = 1 / scale if scale > 1 else float(scale)  # Open3D stores units per metre
     return known
 

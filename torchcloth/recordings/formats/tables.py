@@ -202,7 +202,7 @@ def _split(line: str, separator: str | None) -> list[str]:
     cells = [cell.strip().strip("'\"") for cell in cells]
     if separator not in (",", None):
         cells = [cell.replace(",", ".") if _DECIMAL_COMMA_PATTERN.fullmatch(cell) else cell for cell in cells]
-    return cells[:-1] if separator is not None and not cells[-1] and len(cells) > 1 else cells
+    return cells[:-1] if separator is not None and len(cells) > 1 and not cells[-1] else cells
 
 
 def _is_data(line: str) -> bool:

@@ -22,6 +22,8 @@ from torchcloth.errors import RecordingError
 from torchcloth.meshes import obj
 from torchcloth.recordings import formats, reading, streams
 from torchcloth.recordings.files import Folder
+from torchcloth.recordings.formats.calibration_files import read_intrinsics, read_pose
+from torchcloth.recordings.formats.joint_log import JointNames, read_joint_log
 from torchcloth.recordings.formats.ros2_topics import SCENE_TOPIC
 from torchcloth.recordings.images import import_pillow
 from torchcloth.robots import load as load_arm  # pyright: ignore[reportMissingImports] - mapped from robots/
@@ -36,6 +38,7 @@ TOOL_FRAME = "tool"  # the last link of the seeds
 CHECKED_ANGLE_RAD = 0.3  # of every joint
 READING = "torchcloth.recordings"
 PART_SEPARATOR = b"\n====\n"  # between the files of an input that stands for several
+BENCH_JOINTS = "j1", "j2"
 TUM_IMAGE_NAMES = ("1.png", "2.png")
 # What each topic of the seeds is.
 BAG_SCENE = {
@@ -318,6 +321,22 @@ def read_pcd(data: bytes) -> None:
     scene.write_text(json.dumps({**{key: BAG_SCENE[key] for key in ("provenance", "cloth")}, "source": source}))
     write_parts(folder, ("1.pcd", "stamps.csv", "poses.csv"), data)
     invariants.check_recording(formats.read(folder, scene=scene))
+
+
+@register_format("bench", mutations.mutate_text, READING)
+def read_bench(data: bytes) -> None:
+    """Read a log of joints, the intrinsics and the pose of a camera, as ``torchcloth new`` does."""
+    folder = scratch_folder() / "bench"
+    folder.mkdir(exist_ok=True)
+    write_parts(folder, ("joints.csv", "K.json", "T.txt"), data)
+    limits = np.full(len(BENCH_JOINTS), 3.0)
+    log = read_joint_log(folder / "joints.csv", JointNames(BENCH_JOINTS, limits < 0, -limits, limits, "arm"))
+    require(log.q.shape == (len(log.ns), len(BENCH_JOINTS)), "every joint has a position at every time")
+    require((np.diff(log.ns) > 0).all(), "times increase")
+    require(log.closed is None or len(log.closed) == len(log.ns), "the gripper is open or closed at every time")
+    invariants.check_finite([("joints", log.q)])
+    camera = {"width": 640, "height": 480, **read_intrinsics(folder / "K.json")}
+    invariants.check_camera(rec.Camera(T_world_camera=read_pose(folder / "T.txt"), **camera), "camera")
 
 
 @register_format("tension", mutations.mutate_text, READING)
