@@ -33,7 +33,7 @@ class TorchclothContestant(Contestant):
 def _forward(scene: Scene) -> Callable[[], Outcome]:
     def run() -> Outcome:
         with torch.no_grad():
-            return _outcome(_end(scene, scene.x, scene.motion))
+            return _outcome(end_positions(scene, scene.x, scene.motion))
 
     return run
 
@@ -44,7 +44,7 @@ def _gradient(scene: Scene) -> Callable[[], Outcome]:
         poses = {name: path.pose.clone().requires_grad_() for name, path in scene.motion.items()}
         motion = {name: path._replace(pose=poses[name]) for name, path in scene.motion.items()}
         youngs = cast("tc.PhysicalParameter", scene.cloth.material.youngs_modulus)
-        end = _end(scene, x, motion)
+        end = end_positions(scene, x, motion)
         loss = (end**2).mean()
         gradient_x, by_raw, *by_pose = torch.autograd.grad(loss, [x, youngs.raw, *poses.values()])
         gradient_youngs = float(by_raw / youngs.value.detach())  # raw is the logarithm
@@ -81,7 +81,8 @@ def _counts(cloth: tc.Cloth, name: str, raw: Tensor) -> bool:
     return raw.ndim == 0 and not (director and cloth.contact is None)
 
 
-def _end(scene: Scene, x: Tensor, motion: dict[str, tc.Trajectory]) -> Tensor:
+def end_positions(scene: Scene, x: Tensor, motion: dict[str, tc.Trajectory]) -> Tensor:
+    """Return the positions [..., V, 3] m at the end of a simulation from ``x``."""
     return scene.cloth(scene.cloth.state(x), motion, scene.times, dt=MAX_SUBSTEP_S).x.select(-3, -1)
 
 

@@ -25,7 +25,7 @@ def test_the_gradient_is_that_of_the_loss():
         for sign in (1, -1):
             scene = cases.build_scene(cases.make_case("standard-usual", small=True), "reference", STEPS)
             x = scene.x + sign * size * torch.as_tensor(direction)
-            values.append(float((ours._end(scene, x, scene.motion) ** 2).mean().detach()))
+            values.append(float((ours.end_positions(scene, x, scene.motion) ** 2).mean().detach()))
         errors.append(abs((values[0] - values[1]) / (2 * size) - (direction * outcome.gradient_x).sum()))
     assert errors[1] < 0.3 * errors[0] or errors[1] < 1e-9  # second order
 

@@ -19,6 +19,7 @@ RECORD_BUDGET_BYTES = 192 * 2**20  # records that a simulation keeps for its adj
 RECORD_BUFFERS = RecordBufferPool(RECORD_BUDGET_BYTES)
 RECOMPUTE_BUDGET_BYTES = 96 * 2**20  # records that the adjoint makes at a time when it repeats substeps
 RECORD_ALIGNMENT_BYTES = 64
+MIN_FILLED_LANES = 0.75  # share of a pack's lanes that scenes fill; with fewer, scenes cost less one by one
 MIN_OPS_PER_THREAD = 8e5  # operations of a substep that make another thread worth while: some 20 us
 
 
@@ -163,5 +164,6 @@ def _run(job: Job, ports, mode: RunMode, records: Tensor, record_interval: int, 
         min_ops_per_thread=MIN_OPS_PER_THREAD,
         frame_ends=(ctypes.c_int64 * len(ends))(*ends),
         frames=len(ends),
+        min_filled_lanes=MIN_FILLED_LANES,
     )
     job.program.run(call, mode)

@@ -49,6 +49,7 @@ class RunCall(ctypes.Structure):
         ("min_ops_per_thread", ctypes.c_double),
         ("frame_ends", ctypes.POINTER(ctypes.c_int64)),
         ("frames", ctypes.c_int64),
+        ("min_filled_lanes", ctypes.c_double),
     ]
 
 

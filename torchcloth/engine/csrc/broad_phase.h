@@ -26,14 +26,20 @@ struct PointBroadPhase : Stage<R> {
     }
 
     void forward(Scene<R>& s) const override {
+        if (s.lanes > 1) list_points<Wide<R>>(s);
+        else list_points<Pack<R, 1>>(s);
+    }
+    // Lists the points that may touch the body in any of the scenes in a pack.
+    template <class P>
+    void list_points(Scene<R>& s) const {
         const int* corner = program.tables[corners].data();
         const int* start = program.tables[starts].data();
         const size_t pitch = program.fields[x].pitch;  // also that of the two numbers of each vertex's approach
-        const R *at = s.value[x], *distance = s.value[approach], *speed = distance + 1;
-        const R step = s.value[dt][0];
+        auto packs = [&](int field) { return reinterpret_cast<const P*>(s.value[field]); };
+        const P *at = packs(x), *distance = packs(approach), *speed = distance + 1, step = *packs(dt);
         auto squared = [&](size_t a, size_t b) {
-            R sum = 0;
-            for (int k = 0; k < 3; k++) sum += (at[a + k] - at[b + k]) * (at[a + k] - at[b + k]);
+            P sum(0.0);
+            for (int k = 0; k < 3; k++) sum = sum + (at[a + k] - at[b + k]) * (at[a + k] - at[b + k]);
             return sum;
         };
         thread_local std::vector<int> points;
@@ -41,18 +47,24 @@ struct PointBroadPhase : Stage<R> {
         for (int t = 0; t < triangles; t++) {
             const size_t a = corner[t] * pitch, b = corner[t + triangles] * pitch,
                          c = corner[t + 2 * triangles] * pitch;
-            const R travel = step * std::max(speed[a], std::max(speed[b], speed[c]));
-            auto is_far = [&](size_t corner, R squared_length) {  // by more than rounding
-                return distance[corner] > R(1.0001) * (lipschitz * std::sqrt(squared_length) + travel) + R(1e-6);
+            const P travel = step * larger(speed[a], larger(speed[b], speed[c]));
+            auto is_far = [&](size_t corner, P squared_length) {  // by more than rounding; 1 or 0
+                return less((sqrt(squared_length) * lipschitz + travel) * 1.0001 + 1e-6, distance[corner]);
             };
-            const R ab = squared(a, b), ac = squared(a, c);
-            if (is_far(a, std::max(ab, ac))) continue;
-            const R bc = squared(b, c);
-            if (is_far(b, std::max(ab, bc)) || is_far(c, std::max(ac, bc))) continue;
+            const P ab = squared(a, b), ac = squared(a, c);
+            P far = is_far(a, larger(ab, ac));
+            if (is_one(far)) continue;
+            const P bc = squared(b, c);
+            far = larger(far, larger(is_far(b, larger(ab, bc)), is_far(c, larger(ac, bc))));
+            if (is_one(far)) continue;
             for (int point = start[t]; point < start[t + 1]; point++) points.push_back(point);
         }
         spread_over_packs(points, s.point_lists[list]);
     }
+    template <int L>
+    static Pack<R, L> larger(Pack<R, L> a, Pack<R, L> b) { return select(less(a, b), b, a); }
+    template <int L>
+    static bool is_one(Pack<R, L> a) { return total(a) == R(L); }  // in all lanes
     // The points of a pack are far apart in the mesh, so that additions to one vertex need not wait for each other.
     static void spread_over_packs(const std::vector<int>& points, PointList& to) {
         const size_t count = points.size(), packs = (count + LANES<R> - 1) / LANES<R>;

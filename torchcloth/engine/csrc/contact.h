@@ -44,6 +44,7 @@ struct ContactSearch : Stage<R> {
 
     ContactSearch(const Program<R>& p) : program(p) { this->is_replayed = true; }
 
+    bool runs_in_lanes() const override { return false; }
     void forward(Scene<R>& s) const override { prepare(s); }
     void replay(Scene<R>& s) const override { prepare(s); }
     void tangent(Scene<R>& s) const override { prepare(s); }

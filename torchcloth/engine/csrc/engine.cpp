@@ -146,7 +146,8 @@ struct Engine {
             const auto opcode = tc::Opcode(code);                                                                      \
             loop.code.push_back(                                                                                       \
                 {opcode, field, table, reg, comps, -1, {}, {}, false, loop.slot_of(table),                             \
-                 engine.program.fields[field].kind == tc::FieldKind::points});                                         \
+                 engine.program.fields[field].kind == tc::FieldKind::points,                                           \
+                 engine.program.fields[field].kind == tc::FieldKind::constant});                                       \
             if (opcode == tc::Opcode::load && loop.is_invariant(field, table))                                         \
                 loop.code.back().invariant = engine.program.invariants++;                                              \
             engine.program.registers = std::max(engine.program.registers, reg + comps);                                \

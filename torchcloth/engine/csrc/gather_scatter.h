@@ -3,6 +3,7 @@
 #pragma once
 
 #include <algorithm>
+#include <numeric>
 #include <type_traits>
 
 #include "program.h"
@@ -23,6 +24,7 @@ struct Instruction {
     bool is_needed = false;       // the reverse sweep reads its results
     int table_slot = 0;           // of its table among those of the loop
     bool is_point_field = false;  // the field's kind is points
+    bool is_constant = false;     // the field's kind is constant
     int invariant = -1;           // number of the load in Scene::invariants; -1: it varies
 };
 
@@ -35,9 +37,11 @@ struct ItemSpan {
     int at(int k) const { return list ? list[k] : k; }
 };
 
+// The lanes of a pack are items of one scene.
 template <class R>
 struct GatherScatter {
     static constexpr int L = LANES<R>;
+    static constexpr int ITEMS = L;  // of a pack
     using P = Wide<R>;
 
     const Program<R>& program;
@@ -45,6 +49,18 @@ struct GatherScatter {
     int contact_points;     // which contact points are the items, a contact_count; -1: none
     std::vector<Instruction> code;
     std::vector<int> tables;  // that the loop uses
+    std::vector<int> nearby;  // all items, those of nearby rows one after the other
+
+    // Orders items for loops that take one at a time: what they read was read shortly before. Packs of items want the
+    // contrary, rows that are all different.
+    void order_nearby() {
+        const auto of_rows = std::find_if(tables.begin(), tables.end(), [](int table) { return table >= 0; });
+        if (of_rows == tables.end() || point_list >= 0 || contact_points >= 0) return;
+        const std::vector<int>& row = program.tables[*of_rows];
+        nearby.resize(items);
+        std::iota(nearby.begin(), nearby.end(), 0);
+        std::stable_sort(nearby.begin(), nearby.end(), [&](int a, int b) { return row[a] < row[b]; });
+    }
 
     int slot_of(int table) {
         const auto at = std::find(tables.begin(), tables.end(), table);
@@ -147,6 +163,13 @@ struct GatherScatter {
         else copy_packs(size_t(count));
     }
 
+    TC_INLINE void load(const Scene<R>& scene, const Instruction& i, const R* from, P* to, int first,
+                        const ItemSpan& s) const {
+        if (i.invariant >= 0) from = scene.invariants[i.invariant].packs.data;
+        if (i.invariant >= 0 || i.is_point_field)
+            copy(to + i.reg, reinterpret_cast<const P*>(from + packed_place(i, first)), i.comps);
+        else gather(i, from, to, first, s);
+    }
     TC_APART void gather(const Instruction& i, const R* from, P* to, int first, const ItemSpan& s) const {
         rows(i, first, s, [&](auto place, auto step) {
             if (step == 1)
@@ -186,12 +209,24 @@ struct GatherScatter {
                 P& element = reinterpret_cast<P*>(to + packed_place(i, first))[c];
                 element = element + from[i.reg + c];
             }
-        else if (i.table == SINGLE_ROW && count(first, s) == L)
-            for (int c = 0; c < i.comps; c++) to[c] += total(from[i.reg + c]);
+        else if (i.table == SINGLE_ROW && count(first, s) == L) add_shared(i, to, from);
         else scatter(i, to, from, first, s, [](auto& place, auto x) { place = place + x; });
     }
+    // A single row, which all items share.
+    void gather_shared(const Instruction& i, const R* from, P* to, const ItemSpan& s) const {
+        gather(i, from, to, 0, s);
+    }
+    static void add_shared(const Instruction& i, R* to, const P* from) {
+        for (int c = 0; c < i.comps; c++) to[c] += total(from[i.reg + c]);
+    }
+    // Calls f(first register) for each pack that goes through an instruction: here it is one.
+    template <class F>
+    TC_INLINE void for_each_item(int, const ItemSpan&, F f) const { f(size_t(0)); }
+    template <class F>
+    TC_INLINE void for_each_register_set(F f) const { f(size_t(0)); }
     TC_APART void store(const Instruction& i, R* to, const P* from, int first, const ItemSpan& s) const {
-        scatter(i, to, from, first, s, [](auto& place, auto x) { place = x; });
+        if (i.is_point_field) copy(reinterpret_cast<P*>(to + packed_place(i, first)), from + i.reg, i.comps);
+        else scatter(i, to, from, first, s, [](auto& place, auto x) { place = x; });
     }
     TC_APART void grid_lookup(const Instruction& i, const R* table, P* regs) const {
         const int *in = i.in.data(), out = i.out[0];

@@ -20,6 +20,7 @@ struct GridVelocity : Stage<R> {
         this->is_replayed = true;
     }
 
+    bool runs_in_lanes() const override { return false; }
     void forward(Scene<R>& s) const override {
         if (!sum_copies(s, s.value[momentum], 1)) return;
         const P *m = at(s.value[mass]), *from = at(s.value[momentum]);

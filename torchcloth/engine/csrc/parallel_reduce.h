@@ -13,16 +13,16 @@ struct ParallelReduce : GatherScatter<R> {
     using GatherScatter<R>::row, GatherScatter<R>::contact_points, GatherScatter<R>::tables;
     double ops_per_item = 0;  // approximate operations on numbers
 
-    // Runs f(view, items, first, last) for all items, by threads.
+    // Runs f(view, items, first, last) for all items, by threads; a pack has `items_per_pack`.
     template <class F>
-    void run_parallel(Scene<R>& s, ItemSpan all, RunMode mode, F f) const {
+    void run_parallel(Scene<R>& s, ItemSpan all, RunMode mode, int items_per_pack, F f) const {
         const int parts = parts_of(s, all);
         if (parts == 1) return f(s.view(), all, 0, all.items);
         for (int m = 1; m < parts; m++) lend_fields(s, s.scratch[m - 1], mode);
-        const int packs = (all.items + L - 1) / L;
+        const int packs = (all.items + items_per_pack - 1) / items_per_pack;
         s.team->run(parts, [&](int m) {
-            const int first = begin_of(m, parts, packs) * L,
-                      last = std::min(all.items, begin_of(m + 1, parts, packs) * L);
+            const int first = begin_of(m, parts, packs) * items_per_pack,
+                      last = std::min(all.items, begin_of(m + 1, parts, packs) * items_per_pack);
             if (m == 0) return f(s.view(), all, first, last);
             ThreadScratch<R>& scratch = s.scratch[m - 1];
             clear(s, scratch, all, mode, first, last);
@@ -41,7 +41,7 @@ struct ParallelReduce : GatherScatter<R> {
     // Threads keep to their rows, so that they read mostly what they wrote. Contact points belong to fixed threads.
     int parts_of(const Scene<R>& s, const ItemSpan& all) const {
         if (contact_points == contact_count::active) return s.point_parts;
-        return all.items * ops_per_item * MAX_DIVISION >= s.min_ops_per_thread ? s.parts : 1;
+        return all.items * ops_per_item * s.lanes * MAX_DIVISION >= s.min_ops_per_thread ? s.parts : 1;
     }
 
     // Whether no two items have the same row in a table.
@@ -57,7 +57,7 @@ struct ParallelReduce : GatherScatter<R> {
         const auto wanted = mode == RunMode::adjoints ? Opcode::load : Opcode::add;
         for (const Instruction& i : code) {
             if (i.code != wanted || i.is_point_field || is_unique(i.table)) continue;
-            const size_t pitch = program.fields[i.field].pitch;
+            const size_t pitch = program.fields[i.field].pitch * s.lanes;
             if (mode != RunMode::adjoints) f(i, s.value[i.field], t.value[i.field], t.values[i.field], pitch);
             else if (s.bar[i.field]) f(i, s.bar[i.field], t.bar[i.field], t.bars[i.field], pitch);
             if (mode == RunMode::tangents) f(i, s.dot[i.field], t.dot[i.field], t.dots[i.field], pitch * s.directions);

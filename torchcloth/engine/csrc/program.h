@@ -106,10 +106,11 @@ struct ThreadScratch {
     }
 };
 
-// All that changes in one simulated scene, or in one scene with some directions. As in texts on automatic
-// differentiation, `bar` is an adjoint and `dot` is a tangent.
+// All that changes in one simulated scene, in several that share the lanes of packs, or in these with some directions.
+// As in texts on automatic differentiation, `bar` is an adjoint and `dot` is a tangent.
 template <class R>
 struct Scene {
+    int lanes = 1;  // scenes next to each other: each number of a field, except constants, has one for every scene
     std::vector<R*> value, bar, dot;  // by field; null where there is none
     Buffer<Wide<R>> regs, bars;
     Buffer<R> dots;
@@ -149,6 +150,7 @@ struct Stage {
     virtual void tangent(Scene<R>& s) const = 0;
     virtual void reverse(Scene<R>& s) const = 0;            // values of all fields that it reads are there
     virtual void replay(Scene<R>& s) const { forward(s); }  // writes only numbers that are not recorded
+    virtual bool runs_in_lanes() const { return true; }     // also several scenes in the lanes of packs
     bool is_replayed = false;  // the reverse sweep replays it, because something that it writes is not recorded
 };
 
@@ -179,6 +181,9 @@ struct Program {
         double sum = 0;
         for (const auto& stage : stages) sum += stage->cost(s);
         return int(std::clamp(sum / s.min_ops_per_thread, 1.0, double(s.team->size)));
+    }
+    bool runs_in_lanes() const {
+        return std::all_of(stages.begin(), stages.end(), [](const auto& stage) { return stage->runs_in_lanes(); });
     }
     void lay_out() {  // states first: the record of a coarse checkpoint is the start of a full one
         record_size = 0;

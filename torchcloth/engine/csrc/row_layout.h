@@ -2,6 +2,8 @@
 // are transposed in registers. Fields of one component lie contiguously.
 #pragma once
 
+#include <utility>
+
 #include "pack.h"
 
 namespace tc {
@@ -57,6 +59,20 @@ inline Quad<float> chunk(Pack<float, 16> r) {
 template <int Q>
 inline Quad<double> chunk(Pack<double, 8> r) {
     return Quad<double>(__builtin_shufflevector(r.v, r.v, 4 * Q, 4 * Q + 1, 4 * Q + 2, 4 * Q + 3));
+}
+
+// Transposes a square of numbers: element `lane` of pack k and element k of pack `lane` change places.
+template <int STEP, class R, int L, size_t... I>
+inline void swap_off_diagonal(Pack<R, L>& a, Pack<R, L>& b, std::index_sequence<I...>) {
+    const auto first = __builtin_shufflevector(a.v, b.v, (I & STEP ? L + I - STEP : I)...);
+    const auto second = __builtin_shufflevector(a.v, b.v, (I & STEP ? L + I : I + STEP)...);
+    a.v = first, b.v = second;
+}
+template <int STEP = 1, class R, int L>
+inline void transpose_square(Pack<R, L>* r) {
+    for (int k = 0; k < L; k++)
+        if (!(k & STEP)) swap_off_diagonal<STEP>(r[k], r[k + STEP], std::make_index_sequence<L>{});
+    if constexpr (2 * STEP < L) transpose_square<2 * STEP>(r);
 }
 
 // row(lane) returns where a lane's four numbers lie.

@@ -5,7 +5,7 @@
 #include <exception>
 #include <mutex>
 
-#include "program.h"
+#include "scene_lanes.h"
 
 namespace tc {
 
@@ -31,6 +31,7 @@ struct RunCall {
     double min_ops_per_thread;  // operations of a substep that make another thread worth while
     const int64_t* frame_ends;  // of values: substeps after which there are results
     int64_t frames;             // count of these
+    double min_filled_lanes;    // share of a pack's lanes that scenes fill; fewer scenes run one by one
 };
 
 // Records of a scene before the active triangles.
@@ -53,6 +54,10 @@ class Run {
     const RunCall& call;
     const int64_t interval;  // substeps between records
 
+    struct Group {  // scenes that run together, each in a lane, or a single one
+        int64_t first;
+        int count, lanes;  // lanes beyond the last scene repeat it
+    };
     struct Memory {
         std::unique_ptr<ThreadTeam> team;
         Scene<R> scene;
@@ -65,44 +70,57 @@ class Run {
     Run(const Program<R>& p, const RunCall& c) : program(p), call(c), interval(c.record_interval) {}
 
     void forward() {
-        for_each_task(call.scenes, [&](int64_t scene) {
-            Memory m = memory(scene, RunMode::values, call.scenes);
-            R* first = interval ? record(scene, 0) : nullptr;
-            if (interval) clear_record(scene, interval == 1 ? 0 : record_count(call.substeps, interval) - 1);
-            m.rows.reset(2 * program.record_size);
-            R *row = interval == 1 ? first : m.rows.data, *after = nullptr;
-            load_state(m, scene, row);
+        const std::vector<Group> groups = scene_groups();
+        for_each_task(groups.size(), [&](int64_t task) {
+            const Group& group = groups[task];
+            Memory m = memory(group, RunMode::values, groups.size());
+            const bool in_place = interval == 1 && group.lanes == 1;  // substeps write the records themselves
+            for (int64_t scene = group.first; interval && scene < group.first + group.count; scene++)
+                clear_record(scene, in_place ? 0 : record_count(call.substeps, interval) - 1);
+            m.rows.reset(2 * row_size(group));
+            R *row = in_place ? record(group.first, 0) : m.rows.data, *after = nullptr;
+            load_state(m, group, row);
             int64_t frame = 0;
             for (int64_t k = 0; k < call.substeps; k++) {
-                if (interval > 1 && k % interval == 0) save(record(scene, k / interval), row);
-                if (interval == 1) clear_record(scene, k + 1);
-                after = interval == 1 ? record(scene, k + 1) : other_row(m, row);
+                if (interval > 1 && k % interval == 0) save(group, k / interval, row, program.state_size);
+                if (in_place) clear_record(group.first, k + 1);
+                after = in_place ? record(group.first, k + 1) : other_row(m, group, row);
                 substep(m, k, row, after);
+                if (interval == 1 && !in_place) save(group, k, row, program.record_size);
                 row = after;
-                if (k + 1 == call.frame_ends[frame] && frame + 1 < call.frames) write_frame(m, scene, row, frame++);
+                if (k + 1 == call.frame_ends[frame] && frame + 1 < call.frames) write_frame(m, group, row, frame++);
             }
-            write_frame(m, scene, row, frame);
+            if (interval == 1 && !in_place) save(group, call.substeps, row, program.state_size);
+            write_frame(m, group, row, frame);
             store_policy(m, RunMode::values);
         });
     }
 
     void reverse() {
-        for_each_task(call.scenes, [&](int64_t scene) {
-            Memory m = memory(scene, RunMode::adjoints, call.scenes);
-            load_seeds(m, scene);
-            if (interval > 1) m.rows.reset((interval + 1) * program.record_size);
+        const std::vector<Group> groups = scene_groups();
+        for_each_task(groups.size(), [&](int64_t task) {
+            const Group& group = groups[task];
+            Memory m = memory(group, RunMode::adjoints, groups.size());
+            load_seeds(m, group);
+            const bool in_place = interval == 1 && group.lanes == 1;
+            if (!in_place) m.rows.reset((interval + 1) * row_size(group));
             for (int64_t first = (call.substeps - 1) / interval * interval; first >= 0; first -= interval) {
                 const int64_t last = std::min(first + interval, call.substeps);
-                auto row = [&](int64_t k) {
-                    return interval == 1 ? record(scene, k) : m.rows.data + (k - first) * program.record_size;
+                auto row = [&](int64_t k) {  // with records of all substeps, the two rows change places
+                    return in_place        ? record(group.first, k)
+                           : interval == 1 ? m.rows.data + k % 2 * row_size(group)
+                                           : m.rows.data + (k - first) * row_size(group);
                 };
                 if (interval > 1) {
-                    std::memcpy(row(first), record(scene, first / interval), program.state_size * sizeof(R));
+                    restore(group, first / interval, row(first), program.state_size);
                     for (int64_t k = first; k < last; k++) substep(m, k, row(k), row(k + 1));
+                } else if (!in_place) {
+                    if (last == call.substeps) restore(group, last, row(last), program.state_size);
+                    restore(group, first, row(first), program.record_size);
                 }
                 for (int64_t k = last - 1; k >= first; k--) reverse_substep(m, k, row(k), row(k + 1));
             }
-            store_gradients(m, scene);
+            store_gradients(m, group);
             store_policy(m, RunMode::adjoints);
         });
     }
@@ -111,23 +129,23 @@ class Run {
         const std::vector<DirectionGroup> all = direction_groups();
         const int64_t count = int64_t(all.size());
         for_each_task(call.scenes * count, [&](int64_t task) {
-            const int64_t scene = task / count;
-            const DirectionGroup& group = all[task % count];
-            Memory m = memory(scene, RunMode::tangents, call.scenes * count, group.size);
-            load_tangents(m, scene, group);
+            const Group group{task / count, 1, 1};  // directions share the lanes already
+            const DirectionGroup& directions = all[task % count];
+            Memory m = memory(group, RunMode::tangents, call.scenes * count, directions.size);
+            load_tangents(m, group.first, directions);
             m.rows.reset(2 * program.record_size);
             R *row = m.rows.data, *after = nullptr;
-            load_state(m, scene, row);
+            load_state(m, group, row);
             for (int64_t k = 0; k < call.substeps; k++) {
-                after = other_row(m, row);
+                after = other_row(m, group, row);
                 begin_substep(m, k, row, after);
                 for (const auto& stage : program.stages) stage->tangent(m.scene);
                 for (size_t f = 0; f < program.fields.size(); f++)
                     if (program.next[f] >= 0) std::swap(m.scene.dot[f], m.scene.dot[program.next[f]]);
                 row = after;
             }
-            if (group.first == 0) write_frame(m, scene, row, 0);
-            store_tangents(m, scene, group);
+            if (directions.first == 0) write_frame(m, group, row, 0);
+            store_tangents(m, group.first, directions);
             store_policy(m, RunMode::tangents);
         });
     }
@@ -170,10 +188,45 @@ class Run {
         const size_t size = k == call.substeps && interval == 1 ? program.record_size : program.state_size;
         std::memset(static_cast<void*>(record(scene, k)), 0, size * sizeof(R));
     }
-    R* other_row(const Memory& m, const R* row) const {
-        return row == m.rows.data ? m.rows.data + program.record_size : m.rows.data;
+    // Numbers of a substep's fields that are recorded, for all scenes of a group.
+    size_t row_size(const Group& group) const { return program.record_size * group.lanes; }
+    R* other_row(const Memory& m, const Group& group, const R* row) const {
+        return row == m.rows.data ? m.rows.data + row_size(group) : m.rows.data;
     }
-    void save(R* to, const R* row) const { std::memcpy(to, row, program.state_size * sizeof(R)); }
+    // Copies the first numbers of a row to record k of every scene, and back. Records do not know lanes.
+    void save(const Group& group, int64_t k, const R* row, size_t size) const {
+        if (group.lanes == 1) return void(std::memcpy(record(group.first, k), row, size * sizeof(R)));
+        Wide<R> square[LANES<R>];
+        for (size_t at = 0; at < size; at += LANES<R>) {
+            std::memcpy(static_cast<void*>(square), row + at * LANES<R>, sizeof(square));
+            transpose_square(square);
+            for (int lane = 0; lane < group.count; lane++)
+                std::memcpy(record(group.first + lane, k) + at, &square[lane], sizeof(Wide<R>));
+        }
+    }
+    void restore(const Group& group, int64_t k, R* row, size_t size) const {
+        if (group.lanes == 1) return void(std::memcpy(row, record(group.first, k), size * sizeof(R)));
+        Wide<R> square[LANES<R>];
+        for (size_t at = 0; at < size; at += LANES<R>) {
+            for (int lane = 0; lane < group.lanes; lane++)
+                std::memcpy(static_cast<void*>(&square[lane]), record(scene_of(group, lane), k) + at, sizeof(Wide<R>));
+            transpose_square(square);
+            std::memcpy(row + at * LANES<R>, square, sizeof(square));
+        }
+    }
+
+    std::vector<Group> scene_groups() const {
+        std::vector<Group> out;
+        const bool uses_lanes = program.runs_in_lanes();
+        for (int64_t first = 0; first < call.scenes; first += out.back().count) {
+            const int64_t left = call.scenes - first;
+            const int count = int(std::min<int64_t>(left, LANES<R>));
+            if (uses_lanes && count >= call.min_filled_lanes * LANES<R>) out.push_back({first, count, LANES<R>});
+            else out.push_back({first, 1, 1});
+        }
+        return out;
+    }
+    static int64_t scene_of(const Group& group, int lane) { return group.first + std::min(lane, group.count - 1); }
 
     static bool is_input(FieldKind kind) { return kind == FieldKind::parameter || kind == FieldKind::per_substep; }
     static bool is_within(FieldKind kind) { return kind == FieldKind::temporary || kind == FieldKind::recorded; }
@@ -182,21 +235,24 @@ class Run {
     }
 
     // Memory of one of so many tasks, with tangents along so many directions.
-    Memory memory(int64_t scene, RunMode mode, int64_t tasks, int directions = 0) const {
+    Memory memory(const Group& group, RunMode mode, int64_t tasks, int directions = 0) const {
         Memory m;
+        m.scene.lanes = group.lanes;
         const size_t count = program.fields.size();
         m.scene.value.assign(count, nullptr), m.scene.bar.assign(count, nullptr), m.scene.dot.assign(count, nullptr);
         m.values.resize(count), m.bars.resize(count), m.dots.resize(count);
         m.scene.contact_counts.assign(program.contact_counts, 0),
             m.scene.contact_rows.assign(program.contact_tables, nullptr);
         m.scene.substeps = call.substeps, m.scene.has_masks = mode == RunMode::adjoints;
-        if (interval) m.scene.masks = reinterpret_cast<int32_t*>(record(scene, record_count(call.substeps, interval)));
-        m.scene.regs.reset(program.registers), m.scene.point_lists.resize(program.point_lists);
+        if (interval)
+            m.scene.masks = reinterpret_cast<int32_t*>(record(group.first, record_count(call.substeps, interval)));
+        const size_t registers = size_t(program.registers) * (group.lanes > 1 ? ITEMS_IN_LANES : 1);
+        m.scene.regs.reset(registers), m.scene.point_lists.resize(program.point_lists);
         m.scene.invariants.resize(program.invariants);
-        if (mode == RunMode::adjoints) m.scene.bars.reset(program.registers);
+        if (mode == RunMode::adjoints) m.scene.bars.reset(registers);
         if (mode == RunMode::tangents) {
             m.scene.directions = directions;
-            m.scene.dots.reset(size_t(program.registers) * LANES<R> * directions);
+            m.scene.dots.reset(registers * LANES<R> * directions);
         }
         for (size_t f = 0; f < count; f++) {
             const Field& field = program.fields[f];
@@ -207,13 +263,12 @@ class Run {
             if (field.kind == FieldKind::nodes || field.kind == FieldKind::points) continue;
             if (is_within(field.kind)) m.temporaries.push_back(f);
             if (field.kind == FieldKind::temporary || field.kind == FieldKind::sum || is_input(field.kind)) {
-                m.values[f].reset(size_of(field));
+                m.values[f].reset(size_of(field) * group.lanes);
                 m.scene.value[f] = m.values[f].data;
             }
-            if (is_input(field.kind))
-                load(m.values[f].data, field, call.ports[f].value, scene * call.ports[f].stride, 1);
+            if (is_input(field.kind)) load_scenes(group, m.values[f].data, field, call.ports[f]);
             if (mode == RunMode::adjoints && (!is_input(field.kind) || call.ports[f].gradient)) {
-                m.bars[f].reset(size_of(field));
+                m.bars[f].reset(size_of(field) * group.lanes);
                 m.scene.bar[f] = m.bars[f].data;
             }
             if (mode == RunMode::tangents && (!is_input(field.kind) || call.ports[f].tangent)) {
@@ -269,26 +324,34 @@ class Run {
         for (size_t r = 0; r < rows; r++)
             for (int c = 0; c < f.comps; c++) target[r * f.comps + c] = from[(f.place(r) + c) * depth + which];
     }
+    void load_scenes(const Group& group, R* to, const Field& f, const Port& port) const {
+        for (int lane = 0; lane < group.lanes; lane++)
+            load(to, f, port.value, scene_of(group, lane) * port.stride, group.lanes, lane);
+    }
     size_t outer(const Field& f) const {  // numbers of the caller's array for one scene
         return size_t(f.kind == FieldKind::per_substep ? call.substeps : f.rows) * f.comps;
     }
 
-    void load_state(Memory& m, int64_t scene, R* row) const {
+    void load_state(Memory& m, const Group& group, R* row) const {
         for (size_t f = 0; f < program.fields.size(); f++) {
             const Field& field = program.fields[f];
             if (field.kind == FieldKind::state)
-                load(row + field.offset, field, call.ports[f].value, scene * call.ports[f].stride, 1);
+                load_scenes(group, row + size_t(field.offset) * group.lanes, field, call.ports[f]);
         }
     }
     // Writes the results of a frame, and clears the sums.
-    void write_frame(Memory& m, int64_t scene, const R* row, int64_t frame) const {
+    void write_frame(Memory& m, const Group& group, const R* row, int64_t frame) const {
         for (size_t f = 0; f < program.fields.size(); f++) {
             const Field& field = program.fields[f];
-            const int64_t at = (scene * call.frames + frame) * outer(field);
-            if (program.next[f] >= 0) unload(call.ports[program.next[f]].result, at, field, row + field.offset, 1);
-            if (field.kind != FieldKind::sum) continue;
-            unload(call.ports[f].result, at, field, m.scene.value[f], 1);
-            m.values[f].clear();
+            for (int lane = 0; lane < group.count; lane++) {
+                const int64_t at = ((group.first + lane) * call.frames + frame) * outer(field);
+                if (program.next[f] >= 0)
+                    unload(call.ports[program.next[f]].result, at, field, row + size_t(field.offset) * group.lanes,
+                           group.lanes, lane);
+                if (field.kind == FieldKind::sum)
+                    unload(call.ports[f].result, at, field, m.scene.value[f], group.lanes, lane);
+            }
+            if (field.kind == FieldKind::sum) m.values[f].clear();
         }
     }
 
@@ -312,13 +375,14 @@ class Run {
         if (m.scene.parts > 1) m.team->update_policy();
         for (size_t f = 0; f < program.fields.size(); f++) {
             const Field& field = program.fields[f];
-            if (field.kind == FieldKind::state || field.kind == FieldKind::recorded)
-                m.scene.value[f] = row + field.offset;
-            if (program.next[f] >= 0) m.scene.value[program.next[f]] = after + field.offset;
+            const size_t place = size_t(field.offset) * m.scene.lanes;
+            if (field.kind == FieldKind::state || field.kind == FieldKind::recorded) m.scene.value[f] = row + place;
+            if (program.next[f] >= 0) m.scene.value[program.next[f]] = after + place;
             if (field.kind == FieldKind::per_substep) {
-                m.scene.value[f] = m.values[f].data + k * field.comps;
-                if (m.bars[f].data) m.scene.bar[f] = m.bars[f].data + k * field.comps;
-                if (m.dots[f].data) m.scene.dot[f] = m.dots[f].data + k * field.comps * m.scene.directions;
+                const size_t first = size_t(k) * field.comps * m.scene.lanes;
+                m.scene.value[f] = m.values[f].data + first;
+                if (m.bars[f].data) m.scene.bar[f] = m.bars[f].data + first;
+                if (m.dots[f].data) m.scene.dot[f] = m.dots[f].data + first * m.scene.directions;
             }
         }
     }
@@ -326,7 +390,7 @@ class Run {
         point_to_substep(m, k, row, after);
         clear(m.scene, [&](auto zero) {
             for (size_t f : m.temporaries) {
-                zero(m.scene.value[f], program.fields[f].size());
+                zero(m.scene.value[f], program.fields[f].size() * m.scene.lanes);
                 if (m.scene.dot[f]) zero(m.scene.dot[f], program.fields[f].size() * m.scene.directions);
             }
         });
@@ -340,8 +404,9 @@ class Run {
         clear(m.scene, [&](auto zero) {
             for (size_t f = 0; f < program.fields.size(); f++) {
                 const Field& field = program.fields[f];
-                if (field.kind == FieldKind::state || is_within(field.kind)) zero(m.scene.bar[f], field.size());
-                if (field.kind == FieldKind::temporary) zero(m.scene.value[f], field.size());
+                const size_t size = field.size() * m.scene.lanes;
+                if (field.kind == FieldKind::state || is_within(field.kind)) zero(m.scene.bar[f], size);
+                if (field.kind == FieldKind::temporary) zero(m.scene.value[f], size);
             }
         });
         for (const auto& stage : program.stages) if (stage->is_replayed) stage->replay(m.scene);
@@ -350,20 +415,28 @@ class Run {
             if (program.next[f] >= 0) std::swap(m.scene.bar[f], m.scene.bar[program.next[f]]);
     }
 
-    void load_seeds(Memory& m, int64_t scene) const {
-        for (size_t f = 0; f < program.fields.size(); f++) {
+    void load_seeds(Memory& m, const Group& group) const {
+        for_each_scene(group, [&](size_t f, int64_t scene, int lane) {
             const Field& field = program.fields[f];
             if (field.kind == FieldKind::next || field.kind == FieldKind::sum)
-                load(m.scene.bar[f], field, call.ports[f].seed, scene * outer(field), 1);
-        }
+                load(m.scene.bar[f], field, call.ports[f].seed, scene * outer(field), group.lanes, lane);
+        });
     }
-    void store_gradients(Memory& m, int64_t scene) const {
-        for (size_t f = 0; f < program.fields.size(); f++) {
+    void store_gradients(Memory& m, const Group& group) const {
+        for_each_scene(group, [&](size_t f, int64_t scene, int lane) {
             const Field& field = program.fields[f];
-            void* to = call.ports[f].gradient;
-            if (is_input(field.kind)) unload(to, scene * outer(field), field, m.bars[f].data, 1);
-            if (program.next[f] >= 0) unload(to, scene * outer(field), field, m.scene.bar[program.next[f]], 1);
-        }
+            auto store = [&](const R* from) {
+                unload(call.ports[f].gradient, scene * outer(field), field, from, group.lanes, lane);
+            };
+            if (is_input(field.kind)) store(m.bars[f].data);
+            if (program.next[f] >= 0) store(m.scene.bar[program.next[f]]);
+        });
+    }
+    // Calls work(field, scene, its lane).
+    template <class F>
+    void for_each_scene(const Group& group, F work) const {
+        for (int lane = 0; lane < group.count; lane++)
+            for (size_t f = 0; f < program.fields.size(); f++) work(f, group.first + lane, lane);
     }
 
     void load_tangents(Memory& m, int64_t scene, const DirectionGroup& group) const {

@@ -3,7 +3,7 @@
 
 #include <algorithm>
 
-#include "program.h"
+#include "stencil_lanes.h"
 
 namespace tc {
 
@@ -40,10 +40,12 @@ struct Stencil : Stage<R> {
     }
 
     void forward(Scene<R>& s) const override {
+        if (s.lanes > 1) return lanes(s).forward();
         if (form == StencilForm::transposed) apply_transpose<1>(s.value[weight], s.value[y], s.value[x], R(1));
         else apply<1>(s, s.value[weight], s.value[x], s.value[y], R(1));
     }
     void reverse(Scene<R>& s) const override {
+        if (s.lanes > 1) return lanes(s).reverse();
         if (form == StencilForm::transposed) {
             apply<1>(s, s.value[weight], s.bar[x], s.bar[y], R(-1));
             if (s.bar[weight]) weight_gradient(s, s.bar[x], s.value[y], s.bar[weight], R(-1));
@@ -66,6 +68,10 @@ struct Stencil : Stage<R> {
     }
 
   private:
+    StencilLanes<R> lanes(Scene<R>& s) const {
+        return {s, program.fields[weight], others.data(), used_neighbours.data(), weight, x, y,
+                program.fields[y].pitch, form};
+    }
     size_t at(int c, int v, int n) const { return ((size_t(c) * groups + v / 4) * neighbours + n) * 4 + v % 4; }
     int other(int v, int n) const { return others[at(0, v, n)]; }
     size_t pitch() const { return program.fields[y].pitch; }  // x has 4

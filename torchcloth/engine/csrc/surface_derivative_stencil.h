@@ -74,20 +74,19 @@ struct SurfaceDerivatives : Stage<R> {
     }
 
     void forward(Scene<R>& s) const override {
+        if (s.lanes > 1) return apply_either<Wide<R>>(s, s.value[x], s.value[y], transposed, R(1));
         if (transposed) apply_transpose(s, s.value[y], s.value[x], R(1));
         else apply(s, s.value[x], s.value[y], R(1));
     }
     void reverse(Scene<R>& s) const override {
+        if (s.lanes > 1) return apply_either<Wide<R>>(s, s.bar[x], s.bar[y], !transposed, R(-1));
         if (transposed) apply(s, s.bar[x], s.bar[y], R(-1));
         else apply_transpose(s, s.bar[y], s.bar[x], R(-1));
     }
     void tangent(Scene<R>& s) const override {
         forward(s);
         with_direction_count(s.directions, [&](auto n) {
-            using D = DirectionPack<R, n>;
-            D *in = reinterpret_cast<D*>(s.dot[x]), *out = reinterpret_cast<D*>(s.dot[y]);
-            if (transposed) apply_transpose_jvp(s, out, in);
-            else apply_jvp(s, in, out);
+            apply_either<DirectionPack<R, n>>(s, s.dot[x], s.dot[y], transposed, R(1));
         });
     }
 
@@ -161,8 +160,16 @@ struct SurfaceDerivatives : Stage<R> {
             }
         });
     }
+
+    // Applies the operator or its transpose to fields whose numbers are packs D, of scenes or of directions.
     template <class D>
-    void apply_jvp(const Scene<R>& s, const D* from, D* to) const {
+    void apply_either(const Scene<R>& s, R* field_x, R* field_y, bool transpose, R sign) const {
+        D *x = reinterpret_cast<D*>(field_x), *y = reinterpret_cast<D*>(field_y);
+        if (transpose) apply_transpose_to_packs(s, y, x, sign);
+        else apply_to_packs(s, x, y, sign);
+    }
+    template <class D>
+    void apply_to_packs(const Scene<R>& s, const D* from, D* to, R sign) const {
         const CsrLinks<R>& l = *links->forward;
         over_rows(s, vertices(), [&](int begin, int end) {
             for (int v = begin; v < end; v++) {
@@ -176,12 +183,12 @@ struct SurfaceDerivatives : Stage<R> {
                     }
                 }
                 D* target = to + size_t(v) * 16;
-                for (int c = 0; c < 15; c++) target[c] = target[c] + sum[c];
+                for (int c = 0; c < 15; c++) target[c] = target[c] + double(sign) * sum[c];
             }
         });
     }
     template <class D>
-    void apply_transpose_jvp(const Scene<R>& s, const D* from, D* to) const {
+    void apply_transpose_to_packs(const Scene<R>& s, const D* from, D* to, R sign) const {
         const CsrLinks<R>& l = *links->transpose;
         over_rows(s, vertices(), [&](int begin, int end) {
             for (int v = begin; v < end; v++) {
@@ -193,7 +200,7 @@ struct SurfaceDerivatives : Stage<R> {
                         for (int i = 0; i < 3; i++) sum[i] = sum[i] + row_of_neighbour[3 * c + i] * w[c];
                 }
                 D* target = to + size_t(v) * 4;
-                for (int i = 0; i < 3; i++) target[i] = target[i] + sum[i];
+                for (int i = 0; i < 3; i++) target[i] = target[i] + double(sign) * sum[i];
             }
         });
     }
