@@ -2,13 +2,15 @@
 
 from dataclasses import replace
 
+import numpy as np
 import pytest
 import torch
 from helpers import twins
 
+from torchcloth.episodes.unknowns import collect_unknowns
 from torchcloth.identification import identify
 from torchcloth.identification.estimators import linearity, search
-from torchcloth.identification.estimators.convergence import CONVERGENCE_CRITERIA
+from torchcloth.identification.estimators.convergence import CONVERGENCE_CRITERIA, find_limit_reason
 from torchcloth.identification.estimators.search import Search
 from torchcloth.training.studies import cost
 
@@ -72,6 +74,22 @@ def test_a_search_cut_short_within_a_standard_error_says_why_its_numbers_stand(m
     assert fit.parameters["youngs_modulus"].identifiable
     (warning,) = (w for w in fit.warnings if w.startswith("stopped after"))
     assert "at most one standard error farther, and the standard errors include that step" in warning
+
+
+def test_a_fit_at_the_end_of_a_range_identifies_nothing(model, brief, monkeypatch):
+    monkeypatch.setattr(search, "find_limit_reason", lambda unknowns, raw: "poisson_ratio ended at 0.4999")
+    fit = identify(model, brief, ["youngs_modulus"], exact_bench=True)
+    assert not fit.parameters["youngs_modulus"].identifiable
+    assert any("ended at 0.4999, and no parameter counts as identified" in w for w in fit.warnings), fit.warnings
+
+
+@pytest.mark.parametrize(
+    ("ratio", "is_limit"), [(0.3, False), (0.01, False), (0.49, False), (0.499, True), (1e-3, True)]
+)
+def test_the_end_of_a_range(model, ratio, is_limit):
+    unknowns = collect_unknowns(model, ["youngs_modulus", "poisson_ratio"], None)
+    raw = torch.tensor([9.0, float(np.log(2 * ratio / (1 - 2 * ratio))), 0.3])  # a nuisance follows
+    assert bool(find_limit_reason(unknowns, raw)) == is_limit
 
 
 @pytest.mark.slow
