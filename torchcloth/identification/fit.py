@@ -24,9 +24,18 @@ from ..inspection.corrections import check_all
 from ..parameters import PhysicalParameter
 from ..recordings import Recording
 from .estimators import levenberg_marquardt
+from .estimators.convergence import find_limit_reason
 from .estimators.linearity import LinearityCheck
 from .estimators.objective import Objective
-from .estimators.search import CHAMFER_METHODS, ESTIMATION_METHODS, Method, Outcome, Progress, Search
+from .estimators.search import (
+    CHAMFER_METHODS,
+    ESTIMATION_METHODS,
+    MISFIT_REMEDY,
+    Method,
+    Outcome,
+    Progress,
+    Search,
+)
 from .fit_warnings import fit_warnings, nuisance_warnings, warn_of_skew
 from .io.saved_fit import describe_model
 from .nuisances import GripExtent, add_lookahead, as_stds, bench_nuisances, implied_nuisances, select_nuisances
@@ -291,6 +300,11 @@ def _assemble_result(
         full, used, final, covariance, fine_scene if is_regular else None
     )
     warnings += uncorrected
+    limit = "" if checked.is_withdrawn else find_limit_reason(full.unknowns, final.raw)
+    if limit:
+        checked = checked._replace(failure_reason=limit)
+        final, covariance = checked.final, solution_covariance(used, checked, search.strata)
+        warnings.append(f"corrected for the mesh, {limit}, and no parameter counts as identified: {MISFIT_REMEDY}")
     end = full.observe(final.raw)
     after = [s.x for s in end]
 
