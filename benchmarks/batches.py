@@ -9,13 +9,12 @@ from __future__ import annotations
 import argparse
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from dataclasses import replace
 from functools import partial
 
 import torch
 
-from torchcloth.engine import execution
+from torchcloth.engine.execution import min_filled_lanes
 
 from .cases import Case, Scene, build_scene, make_case
 from .ours import end_positions
@@ -86,17 +85,6 @@ def processor_seconds(run: Callable[[], None]) -> float:
 def _run_one_by_one(run: Callable[[], None]) -> None:
     with min_filled_lanes(2 * ALL_LANES):
         run()
-
-
-@contextmanager
-def min_filled_lanes(share: float) -> Iterator[None]:
-    """Let scenes share lanes only where they fill so much of them."""
-    before = execution.MIN_FILLED_LANES
-    execution.MIN_FILLED_LANES = share
-    try:
-        yield
-    finally:
-        execution.MIN_FILLED_LANES = before
 
 
 if __name__ == "__main__":

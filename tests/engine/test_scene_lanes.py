@@ -10,7 +10,6 @@ from helpers.engine_agreement import (
     make_moving_hand,
     make_moving_state,
     sample_motion,
-    scenes_in_lanes,
 )
 from torch.func import grad, jacrev
 
@@ -36,9 +35,13 @@ def typical_effects() -> dict[str, E.AbstractEffect]:
     return {"gravity": E.Gravity(), "air": E.AirDrag(), "bending": E.Bending(1e-4, 0.02, weft_ratio=0.5)}
 
 
-def compute_one_by_one(cloth, motion, state) -> Outcome:
-    with scenes_in_lanes(2.0):  # more than all lanes
-        return compute_outcome(fused.rollout, cloth, motion, state, SUBSTEPS, DT)
+def check_lanes(cloth, motion, state, tolerances=TOLERANCES) -> tuple[Outcome, Outcome]:
+    """Check that scenes in lanes and one by one agree, and return both outcomes."""
+    outcome = compute_outcome(fused.rollout, cloth, motion, state, SUBSTEPS, DT)
+    with execution.min_filled_lanes(2.0):  # more than all lanes
+        reference = compute_outcome(fused.rollout, cloth, motion, state, SUBSTEPS, DT)
+    compare_outcomes(outcome, reference, tolerances)
+    return outcome, reference
 
 
 @pytest.mark.parametrize("scenes", [6, 8, 19], ids=str)
@@ -47,12 +50,10 @@ def test_equals_scenes_one_by_one(scenes):
     cloth.requires_grad_(True)
     state = make_moving_state(cloth, (scenes,))
     motion = {"hand": make_moving_hand(SUBSTEPS * DT, scenes=(scenes,))}
-    reference = compute_one_by_one(cloth, motion, state)
-    outcome = compute_outcome(fused.rollout, cloth, motion, state, SUBSTEPS, DT)
+    outcome, reference = check_lanes(cloth, motion, state)
     assert any(not torch.equal(value, reference.values[name]) for name, value in outcome.values.items()), (
         "the scenes did not share lanes"
     )
-    compare_outcomes(outcome, reference, TOLERANCES)
 
 
 def test_every_scene_has_parameters_of_its_own():
@@ -62,11 +63,7 @@ def test_every_scene_has_parameters_of_its_own():
     cloth.requires_grad_(True)
     state = make_moving_state(cloth, (LANES,))
     motion = {"hand": make_moving_hand(SUBSTEPS * DT)}
-    compare_outcomes(
-        compute_outcome(fused.rollout, cloth, motion, state, SUBSTEPS, DT),
-        compute_one_by_one(cloth, motion, state),
-        TOLERANCES,
-    )
+    check_lanes(cloth, motion, state)
 
 
 @pytest.mark.parametrize("budget", [0, 2**40], ids=["recomputed", "recorded"])
@@ -76,11 +73,7 @@ def test_records_of_any_interval(budget, monkeypatch):
     monkeypatch.setattr(execution, "RECOMPUTE_BUDGET_BYTES", budget)
     cloth = make_cloth(**typical_effects())
     state, motion = make_moving_state(cloth, (LANES,)), {"hand": make_moving_hand(SUBSTEPS * DT)}
-    compare_outcomes(
-        compute_outcome(fused.rollout, cloth, motion, state, SUBSTEPS, DT),
-        compute_one_by_one(cloth, motion, state),
-        TOLERANCES,
-    )
+    check_lanes(cloth, motion, state)
 
 
 @pytest.mark.parametrize("interval", [0, 1, 7])
@@ -103,19 +96,11 @@ def test_a_jacobian_reads_the_records_of_a_scene_that_ran_alone(interval):
 def test_a_team_of_threads_shares_the_work():
     cloth = make_cloth(**typical_effects())
     state, motion = make_moving_state(cloth, (LANES,)), {"hand": make_moving_hand(SUBSTEPS * DT)}
-    compare_outcomes(
-        compute_outcome(fused.rollout, cloth, motion, state, SUBSTEPS, DT),
-        compute_one_by_one(cloth, motion, state),
-        TOLERANCES,
-    )
+    check_lanes(cloth, motion, state)
 
 
 def test_float32():
     cloth = make_cloth(**typical_effects())
     state, motion = make_moving_state(cloth, (16,)), {"hand": make_moving_hand(SUBSTEPS * DT)}
     cloth, state = cloth.float(), state.map(lambda t: t.float())
-    compare_outcomes(
-        compute_outcome(fused.rollout, cloth, motion, state, SUBSTEPS, DT),
-        compute_one_by_one(cloth, motion, state),
-        (1e-4, 1e-3),
-    )
+    check_lanes(cloth, motion, state, (1e-4, 1e-3))

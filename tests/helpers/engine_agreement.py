@@ -8,11 +8,9 @@ parameters should differ, so that the comparison reaches every branch and sign.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping
 from copy import deepcopy
 from typing import NamedTuple
-from unittest import mock
 
 import torch
 from torch import Tensor
@@ -51,7 +49,7 @@ def check_agreement(
     reference = compute_outcome(roll_out_in_segments, cloth, motion, state, substeps, dt, stages)
     engine = compute_outcome(fused.rollout, cloth, motion, state, substeps, dt, stages)
     results = compare_outcomes(engine, reference, tolerances)
-    with scenes_in_lanes():
+    with execution.min_filled_lanes(0.0):  # a single scene is repeated in all lanes
         in_lanes = compute_outcome(fused.rollout, cloth, motion, state, substeps, dt, stages)
     compare_outcomes(in_lanes, reference, tolerances)
     check_graph_capture(cloth, motion, state, dt, stages)
@@ -78,13 +76,6 @@ def compare_outcomes(engine: Outcome, reference: Outcome, tolerances: tuple[floa
     worse = {name: value for name, value in results.items() if not value <= tolerances[1]}
     assert not worse, worse
     return results
-
-
-@contextmanager
-def scenes_in_lanes(min_filled_lanes: float = 0.0) -> Iterator[None]:
-    """Let scenes share the lanes of packs from so small a share on; a single one is then repeated in all lanes."""
-    with mock.patch.object(execution, "MIN_FILLED_LANES", min_filled_lanes):
-        yield
 
 
 def check_graph_capture(

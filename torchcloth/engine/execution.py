@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import ctypes
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from typing import NamedTuple
 
 import torch
@@ -112,6 +113,17 @@ def tangent(
         ports[f.id].tangent, ports[f.id].tangent_stride = tensor.data_ptr(), _scene_stride(tensor)
     _run(job, ports, RunMode.TANGENTS, like, 0, directions)
     return results, result_tangents
+
+
+@contextmanager
+def min_filled_lanes(share: float) -> Iterator[None]:
+    """Let scenes share the lanes of packs from another ``share`` of filled lanes on; above 1 they never do."""
+    global MIN_FILLED_LANES
+    before, MIN_FILLED_LANES = MIN_FILLED_LANES, share
+    try:
+        yield
+    finally:
+        MIN_FILLED_LANES = before
 
 
 def checkpoint_interval(job: Job) -> int:

@@ -62,8 +62,6 @@ struct PointBroadPhase : Stage<R> {
         spread_over_packs(points, s.point_lists[list]);
     }
     template <int L>
-    static Pack<R, L> larger(Pack<R, L> a, Pack<R, L> b) { return select(less(a, b), b, a); }
-    template <int L>
     static bool is_one(Pack<R, L> a) { return total(a) == R(L); }  // in all lanes
     // The points of a pack are far apart in the mesh, so that additions to one vertex need not wait for each other.
     static void spread_over_packs(const std::vector<int>& points, PointList& to) {

@@ -106,10 +106,7 @@ struct ContactSearch : Stage<R> {
         const Quad<R>* now = reinterpret_cast<const Quad<R>*>(s.value[x]);
         const Quad<R>* reference = reinterpret_cast<const Quad<R>*>(state.reference.data);
         Quad<R> largest(0.0);
-        for (int v = 0; v < program.fields[x].rows; v++) {
-            const Quad<R> displacement = abs(now[v] - reference[v]);
-            largest = select(less(largest, displacement), displacement, largest);
-        }
+        for (int v = 0; v < program.fields[x].rows; v++) largest = larger(largest, abs(now[v] - reference[v]));
         return std::max(largest[0], std::max(largest[1], largest[2])) >= skin / 2;
     }
     void search_layers(const Scene<R>& s, ContactState<R>& state) const {

@@ -88,6 +88,8 @@ inline Pack<R, L> at_least(Pack<R, L> a, double c) { return select(less(a, c), P
 template <class R, int L>
 inline Pack<R, L> at_most(Pack<R, L> a, double c) { return select(less(c, a), Pack<R, L>(c), a); }
 template <class R, int L>
+inline Pack<R, L> larger(Pack<R, L> a, Pack<R, L> b) { return select(less(a, b), b, a); }
+template <class R, int L>
 inline Pack<R, L> abs(Pack<R, L> a) { return select(less(a, 0.0), -a, a); }
 template <class R, int L>
 inline Pack<R, L> detach(Pack<R, L> a) { return a; }

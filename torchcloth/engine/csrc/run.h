@@ -74,7 +74,7 @@ class Run {
         for_each_task(groups.size(), [&](int64_t task) {
             const Group& group = groups[task];
             Memory m = memory(group, RunMode::values, groups.size());
-            const bool in_place = interval == 1 && group.lanes == 1;  // substeps write the records themselves
+            const bool in_place = has_rows_in_records(group);
             for (int64_t scene = group.first; interval && scene < group.first + group.count; scene++)
                 clear_record(scene, in_place ? 0 : record_count(call.substeps, interval) - 1);
             m.rows.reset(2 * row_size(group));
@@ -102,7 +102,7 @@ class Run {
             const Group& group = groups[task];
             Memory m = memory(group, RunMode::adjoints, groups.size());
             load_seeds(m, group);
-            const bool in_place = interval == 1 && group.lanes == 1;
+            const bool in_place = has_rows_in_records(group);
             if (!in_place) m.rows.reset((interval + 1) * row_size(group));
             for (int64_t first = (call.substeps - 1) / interval * interval; first >= 0; first -= interval) {
                 const int64_t last = std::min(first + interval, call.substeps);
@@ -188,6 +188,8 @@ class Run {
         const size_t size = k == call.substeps && interval == 1 ? program.record_size : program.state_size;
         std::memset(static_cast<void*>(record(scene, k)), 0, size * sizeof(R));
     }
+    // Whether substeps read and write the records themselves, and no copies.
+    bool has_rows_in_records(const Group& group) const { return interval == 1 && group.lanes == 1; }
     // Numbers of a substep's fields that are recorded, for all scenes of a group.
     size_t row_size(const Group& group) const { return program.record_size * group.lanes; }
     R* other_row(const Memory& m, const Group& group, const R* row) const {

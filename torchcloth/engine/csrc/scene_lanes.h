@@ -25,17 +25,18 @@ struct SceneLanes {
     void prepare_rows(const ItemSpan&, int*, int) const {}
     void gather_invariants(Scene<R>&, const ItemSpan&) const {}
 
-    // Calls f(its first register) for every item from the first one on, or for all registers of shared numbers.
+    // Calls f(first of its registers) for every item from `first` on.
     template <class F>
     TC_INLINE void for_each_item(int first, const ItemSpan& s, F f) const {
         const int count = std::min(ITEMS, s.items - first);
         for (int k = 0; k < count; k++) f(size_t(k) * loop.program.registers);
     }
+    // Calls f(first register) for every set of registers: numbers that items share stand in all of them.
     template <class F>
     TC_INLINE void for_each_register_set(F f) const {
         for (int k = 0; k < ITEMS; k++) f(size_t(k) * loop.program.registers);
     }
-    // Calls f(number of the element where its row begins, first register) for every item from the first one on.
+    // Calls f(number of the element where its row begins, first of its registers) for every item from `first` on.
     template <class F>
     TC_INLINE void rows(const Instruction& i, int first, const ItemSpan& s, F f) const {
         const size_t pitch = loop.pitch(i), registers = loop.program.registers;
@@ -99,7 +100,7 @@ struct SceneLanes {
     static P* packs(R* field) { return reinterpret_cast<P*>(field); }
     static const P* packs(const R* field) { return reinterpret_cast<const P*>(field); }
     static TC_INLINE void broadcast(const Instruction& i, const R* from, P* to) {
-        for (int c = 0; c < i.comps; c++) to[i.reg + c] = P(typename P::Lanes{} + from[c]);
+        for (int c = 0; c < i.comps; c++) to[i.reg + c] = P(from[c]);
     }
 };
 

@@ -39,8 +39,8 @@ struct StencilLanes {
     }
     size_t row(int c, int v) const { return size_t(v) * pitch + 3 * c; }
     P weight_at(size_t at) const {
-        const R* w = s.value[weight];
-        return weights.kind == FieldKind::constant ? P(typename P::Lanes{} + w[at]) : packs(s.value[weight])[at];
+        R* w = s.value[weight];
+        return weights.kind == FieldKind::constant ? P(w[at]) : packs(w)[at];
     }
     // Calls f(place of the weight, neighbour) for the weights of a vertex.
     template <class F>
