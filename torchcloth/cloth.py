@@ -435,9 +435,11 @@ class Cloth(nn.Module):
     ) -> Callable[[ClothState], float]:
         """Return a function that gives the longest substep [s] for a state, which plastic set shortens."""
 
+        is_gripped = self._find_gripped_corners(motion)
+
         def longest_step(state: ClothState) -> float:
             plastic = state.memory[MATERIAL_MEMORY_KEY].detach()
-            limits = stability_limits(model, self._gradient, plastic, self._find_gripped_corners(motion))
+            limits = stability_limits(model, self._gradient, plastic, is_gripped)
             return check_step(dt, limits.stable_step(model.stages))
 
         return longest_step
