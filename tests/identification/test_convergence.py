@@ -8,6 +8,7 @@ import torch
 from helpers import twins
 
 from torchcloth.episodes.unknowns import collect_unknowns
+from torchcloth.identification import fit as fit_module
 from torchcloth.identification import identify
 from torchcloth.identification.estimators import linearity, search
 from torchcloth.identification.estimators.convergence import CONVERGENCE_CRITERIA, find_limit_reason
@@ -77,7 +78,7 @@ def test_a_search_cut_short_within_a_standard_error_says_why_its_numbers_stand(m
 
 
 def test_a_fit_at_the_end_of_a_range_identifies_nothing(model, brief, monkeypatch):
-    monkeypatch.setattr(search, "find_limit_reason", lambda unknowns, raw: "poisson_ratio ended at 0.4999")
+    monkeypatch.setattr(fit_module, "find_limit_reason", lambda unknowns, raw: "poisson_ratio ended at 0.4999")
     fit = identify(model, brief, ["youngs_modulus"], exact_bench=True)
     assert not fit.parameters["youngs_modulus"].identifiable
     assert any("ended at 0.4999, and no parameter counts as identified" in w for w in fit.warnings), fit.warnings

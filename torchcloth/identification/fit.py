@@ -27,15 +27,7 @@ from .estimators import levenberg_marquardt
 from .estimators.convergence import find_limit_reason
 from .estimators.linearity import LinearityCheck
 from .estimators.objective import Objective
-from .estimators.search import (
-    CHAMFER_METHODS,
-    ESTIMATION_METHODS,
-    MISFIT_REMEDY,
-    Method,
-    Outcome,
-    Progress,
-    Search,
-)
+from .estimators.search import CHAMFER_METHODS, ESTIMATION_METHODS, Method, Outcome, Progress, Search
 from .fit_warnings import fit_warnings, nuisance_warnings, warn_of_skew
 from .io.saved_fit import describe_model
 from .nuisances import GripExtent, add_lookahead, as_stds, bench_nuisances, implied_nuisances, select_nuisances
@@ -62,7 +54,7 @@ from .uncertainty.richardson import (
 DEFAULT_MAX_ITERATIONS = 35  # of the DiffCP paper
 MAX_STARTS = 1000
 NO_PROFILE_REASON = "the motion can be predicted for a while only, or by simulations spread around the solution"
-NO_PROFILE_OF_MISFIT_REASON = "the model does not describe these data"
+MISFIT_NOTE = "the model does not describe these data"
 
 
 @isolated_grad_mode()
@@ -300,11 +292,6 @@ def _assemble_result(
         full, used, final, covariance, fine_scene if is_regular else None
     )
     warnings += uncorrected
-    limit = "" if checked.is_withdrawn else find_limit_reason(full.unknowns, final.raw)
-    if limit:
-        checked = checked._replace(failure_reason=limit)
-        final, covariance = checked.final, solution_covariance(used, checked, search.strata)
-        warnings.append(f"corrected for the mesh, {limit}, and no parameter counts as identified: {MISFIT_REMEDY}")
     end = full.observe(final.raw)
     after = [s.x for s in end]
 
@@ -314,7 +301,7 @@ def _assemble_result(
     has_profiles = not (checked.warnings or checked.is_withdrawn)
     profiles = compute_profiles(used, final, covariance, profile, search.report_progress) if has_profiles else {}
     if profile and not has_profiles:
-        why = NO_PROFILE_OF_MISFIT_REASON if misfit_reason else NO_PROFILE_REASON
+        why = MISFIT_NOTE if misfit_reason else NO_PROFILE_REASON
         warnings.append(f"no profile of {', '.join(profile)}: {why}")
     estimates = apply_profiles(estimates, profiles)
 
@@ -391,7 +378,7 @@ def _unusable_parameters(full: Objective, checked: LinearityCheck, profiles: Map
 def _find_misfit(
     full: Objective, used: Objective, final: levenberg_marquardt.Iterate, chamfer_before: float, noise_std: float
 ) -> tuple[str, dict[str, float]]:
-    """Find out whether the fit is too far from the points to say anything.
+    """Find out whether the fit is too far from the points, or at the end of a range, to say anything.
 
     Args:
         full: objective of all frames.
@@ -403,13 +390,13 @@ def _find_misfit(
     Returns:
         Why it is, and the share of the misfit that each error of the recording would explain; empty where it is not.
     """
-    misfit = _observation_entries(used, final).get("points_misfit")
-    if misfit is None:
-        return "", {}
-    over_start = full.distance_metrics(final.raw).chamfer / chamfer_before if chamfer_before > 0 else 0.0
-    reason = find_misfit(misfit, noise_std, over_start)
+    misfit, reason = _observation_entries(used, final).get("points_misfit"), ""
+    if misfit is not None:
+        over_start = full.distance_metrics(final.raw).chamfer / chamfer_before if chamfer_before > 0 else 0.0
+        reason = find_misfit(misfit, noise_std, over_start)
     if not reason:
-        return "", {}
+        limit = find_limit_reason(full.unknowns, final.raw)
+        return f"{limit}, and no parameter counts as identified: {MISFIT_NOTE}" if limit else "", {}
     reasons = rank_reasons(used, final)
     return f"{reason}; {describe_reasons(reasons)}", {r.name: r.share for r in reasons}
 

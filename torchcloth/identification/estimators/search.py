@@ -14,7 +14,7 @@ from ..uncertainty.consider_covariance import points_misfit, solution_covariance
 from ..uncertainty.estimates import make_estimates
 from ..uncertainty.misfit import find_misfit
 from . import cross_entropy, levenberg_marquardt, linearity, multistart, predictability, statistical_linearisation
-from .convergence import find_failure_reason, find_limit_reason
+from .convergence import find_failure_reason
 from .gradient_descent import chamfer_to_nearest_vertex, minimise_by_gradient_descent, minimise_by_lbfgs
 from .objective import Objective
 
@@ -34,7 +34,6 @@ HOPED_STD_RATIO = 2.0  # by which standard errors may yet fall in more rounds of
 MAX_STAMP_ROUNDS = 2  # searches that follow a new estimate of the stamps' scatter
 MIN_STAMP_STD_CHANGE = 0.2  # of the scatter of the stamps, for another search
 SAMPLED_FIT_NOTE = "simulations around the solution know what is near, not what is best"
-MISFIT_REMEDY = "the model does not describe these data"
 UNFINISHED_REMEDY = (
     "more iterations of Gauss-Newton, a nearer start or several, or fewer parameters at once may get there"
 )
@@ -122,13 +121,12 @@ class Search:
         else:
             used = full
         reason = "" if checked.final.converged else self._unfinished_reason(method)
-        limit = "" if checked.is_withdrawn else find_limit_reason(full.unknowns, checked.final.raw)
         is_regular = not reason and checked.covariance is None
-        failure = limit or ("" if is_regular or checked.is_withdrawn else find_failure_reason(used, checked))
+        failure = "" if is_regular or checked.is_withdrawn else find_failure_reason(used, checked)
         if failure:
-            causes = [reason or ("" if is_regular else SAMPLED_FIT_NOTE), failure]
-            remedy = MISFIT_REMEDY if limit else UNFINISHED_REMEDY
-            reason = f"{'; '.join(filter(None, causes))}, and no parameter counts as identified: {remedy}"
+            reason = (
+                f"{reason or SAMPLED_FIT_NOTE}; {failure}, and no parameter counts as identified: {UNFINISHED_REMEDY}"
+            )
             checked = checked._replace(failure_reason=failure)
         elif reason and not checked.is_withdrawn:
             reason = f"{reason}; {NEAR_OPTIMUM_NOTE}"
