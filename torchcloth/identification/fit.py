@@ -24,7 +24,7 @@ from ..inspection.corrections import check_all
 from ..parameters import PhysicalParameter
 from ..recordings import Recording
 from .estimators import levenberg_marquardt
-from .estimators.convergence import find_limit_reason
+from .estimators.convergence import find_limit_reasons
 from .estimators.linearity import LinearityCheck
 from .estimators.objective import Objective
 from .estimators.search import CHAMFER_METHODS, ESTIMATION_METHODS, Method, Outcome, Progress, Search
@@ -54,7 +54,7 @@ from .uncertainty.richardson import (
 DEFAULT_MAX_ITERATIONS = 35  # of the DiffCP paper
 MAX_STARTS = 1000
 NO_PROFILE_REASON = "the motion can be predicted for a while only, or by simulations spread around the solution"
-MISFIT_NOTE = "the model does not describe these data"
+NO_PROFILE_OF_MISFIT_REASON = "the model does not describe these data"
 
 
 @isolated_grad_mode()
@@ -301,7 +301,7 @@ def _assemble_result(
     has_profiles = not (checked.warnings or checked.is_withdrawn)
     profiles = compute_profiles(used, final, covariance, profile, search.report_progress) if has_profiles else {}
     if profile and not has_profiles:
-        why = MISFIT_NOTE if misfit_reason else NO_PROFILE_REASON
+        why = NO_PROFILE_OF_MISFIT_REASON if misfit_reason else NO_PROFILE_REASON
         warnings.append(f"no profile of {', '.join(profile)}: {why}")
     estimates = apply_profiles(estimates, profiles)
 
@@ -329,11 +329,16 @@ def _assemble_result(
     unbeaten_null = find_unbeaten_null(full, end)
     if mesh_entries:  # it moved the solution
         misfit_reason, likely_reasons = _find_misfit(full, used, final, chamfer_before, noise_std)
+    limits = find_limit_reasons(full.unknowns, final.raw)
+    warnings += [
+        f"{reason}: no estimate of {', '.join(n for n in limits if limits[n] == reason)}"
+        for reason in dict.fromkeys(limits.values())
+    ]
     is_withdrawn = checked.is_withdrawn or bool(unbeaten_null or misfit_reason)
     fit["withdrawn"] = is_withdrawn
     if is_withdrawn:  # slopes of chaos, or far from the optimum, promise tiny errors
         estimates = withdraw_estimates(estimates, full.unknowns, final.raw)
-    elif unusable := _unusable_parameters(full, checked, profiles):
+    elif unusable := _unusable_parameters(full, checked, profiles) | set(limits):
         estimates = withdraw_estimates(estimates, full.unknowns, final.raw, unusable)
     warnings += [reason for reason in (misfit_reason, outcome.unfinished_reason) if reason]
     warnings += warn_of_skew(estimates, [name for name in checked.curved_parameters if name not in profiles])
@@ -378,7 +383,7 @@ def _unusable_parameters(full: Objective, checked: LinearityCheck, profiles: Map
 def _find_misfit(
     full: Objective, used: Objective, final: levenberg_marquardt.Iterate, chamfer_before: float, noise_std: float
 ) -> tuple[str, dict[str, float]]:
-    """Find out whether the fit is too far from the points, or at the end of a range, to say anything.
+    """Find out whether the fit is too far from the points to say anything.
 
     Args:
         full: objective of all frames.
@@ -390,13 +395,13 @@ def _find_misfit(
     Returns:
         Why it is, and the share of the misfit that each error of the recording would explain; empty where it is not.
     """
-    misfit, reason = _observation_entries(used, final).get("points_misfit"), ""
-    if misfit is not None:
-        over_start = full.distance_metrics(final.raw).chamfer / chamfer_before if chamfer_before > 0 else 0.0
-        reason = find_misfit(misfit, noise_std, over_start)
+    misfit = _observation_entries(used, final).get("points_misfit")
+    if misfit is None:
+        return "", {}
+    over_start = full.distance_metrics(final.raw).chamfer / chamfer_before if chamfer_before > 0 else 0.0
+    reason = find_misfit(misfit, noise_std, over_start)
     if not reason:
-        limit = find_limit_reason(full.unknowns, final.raw)
-        return f"{limit}, and no parameter counts as identified: {MISFIT_NOTE}" if limit else "", {}
+        return "", {}
     reasons = rank_reasons(used, final)
     return f"{reason}; {describe_reasons(reasons)}", {r.name: r.share for r in reasons}
 

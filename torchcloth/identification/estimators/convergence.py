@@ -70,24 +70,27 @@ def find_failure_reason(
     return f"its slopes lead {remaining:.0f} standard errors farther" if is_far else ""
 
 
-def find_limit_reason(
+def find_limit_reasons(
     unknowns: Sequence[Unknown], raw: Tensor, criteria: ConvergenceCriteria = CONVERGENCE_CRITERIA
-) -> str:
-    """Return which bounded parameter a search pushed to the end of its range; empty where there is none.
+) -> dict[str, str]:
+    """Return why parameters are no estimates, by name: a bounded one of the same law is at the end of its range.
 
-    Only data that the model does not describe push it there. The unconstrained number has no effect there any more, so
-    the standard errors of what correlates with it are those of a fit without it.
+    The unconstrained number has no effect there any more, so the law's other standard errors are those of a fit without
+    it. Forces that do not depend on this law keep their estimates.
 
     Args:
         unknowns: parameters of the fit.
-        raw: [K] where the search ended; nuisances may follow.
+        raw: [K] the solution; nuisances may follow.
         criteria: the limits.
     """
+    reasons = {}
     for unknown, number in zip(unknowns, raw.tolist(), strict=False):
         share = 1 / (1 + math.exp(-number)) if unknown.parameter.domain == "unit_half" else 0.5
         if 4 * share * (1 - share) < criteria.min_relative_slope:
-            return f"{unknown.name} ended at {0.5 * share:.4f}, the end of its range"
-    return ""
+            law = unknown.key.removesuffix(f"{unknown.name}.raw")
+            reason = f"{unknown.name} ended at {0.5 * share:.4f}, the end of its range"
+            reasons |= {u.name: reason for u in unknowns if u.key.startswith(law)}
+    return reasons
 
 
 def remaining_std_errors(
