@@ -97,7 +97,7 @@ def test_data_parallel_training_waits_for_no_parameter_that_cannot_act(engine, t
         parallel = nn.parallel.DistributedDataParallel(cloth)
         for _ in range(3):
             parallel(cloth.rest_state(), motion, times=(0.0, 0.04)).x[-1].square().sum().backward()
-        # torch joins gloo's thread with Python's lock held, and deadlocks if that thread still needs it for its last work
+        # torch joins gloo's thread with Python's lock held; that thread may still need it for its last work
         time.sleep(GLOO_THREAD_S)
     finally:
         torch.distributed.destroy_process_group()
