@@ -90,7 +90,7 @@ def set_clock(recording: Recording, paths: dict[str, GripperPath], view: PointCl
     lags = [
         lag
         for offset in (offsets if len(view) >= MIN_SEEN_IMAGES else [])
-        if (lag := estimate_lag(replace(seen, clock_offset=offset), paths)) is not None
+        if (lag := estimate_lag(replace(seen, clock_offset=offset), paths, is_one_clock=is_one_clock)) is not None
     ]
     best = min((lag for lag in lags if lag.is_determined), key=lambda lag: lag.misfit, default=None)
     if not is_one_clock:
@@ -99,9 +99,11 @@ def set_clock(recording: Recording, paths: dict[str, GripperPath], view: PointCl
             text = "both begin at once, which no motion of the gripper confirms: check it"
             return recording, [name + text]
         offset = -best.value
-        return replace(recording, clock_offset=offset), [
-            f"{name}the motion of the gripper in the images gives the clock to {1e3 * best.std:.0f} ms"
-        ]
+        text = f"{name}the motion of the gripper in the images gives the clock to {1e3 * best.std:.0f} ms"
+        if best.rivals:
+            others = ", ".join(f"{rival - best.value:+.2f}" for rival in best.rivals)
+            text += f", if it does not repeat itself: a clock that is {others} s off explains it as well"
+        return replace(recording, clock_offset=offset), [text]
     if best is None or not best.differs_from_recorded:
         return recording, ["clock: images and joints are on one clock" + _describe_agreement(best)]
     return replace(recording, clock_offset=-best.value), [

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from itertools import product
 from types import MappingProxyType
 
 import numpy as np
@@ -24,6 +25,7 @@ JACKKNIFE_BLOCKS = 10
 MAX_LAG_STD_S = 0.05  # of a lag that is determined
 MIN_COST_CONTRAST = 1.15  # median over smallest misfit, of a lag that is determined
 MIN_DIFFERENCE_STDS, MIN_LAG_DIFFERENCE_S = 3.0, 0.02  # both must be exceeded by the difference from the recorded lag
+MAX_RIVAL_P_VALUE = 0.01  # of a misfit that is larger by chance alone, below which another minimum is no rival
 LAG_CAVEAT = (
     "it is the delay of the observed cloth near the grippers behind the grippers. It includes the delay of stamps, the "
     "delay of the cloth itself and that of a loose grip. At constant speed a lag is the same as an offset"
@@ -40,6 +42,7 @@ class LagEstimate:
             bound from the misfit and the variation of the velocity.
         is_determined: whether the recording determines the lag. The minimum must lie inside the search range, the
             standard error below 0.05 s, and the misfit clearly below its median.
+        rivals: other lags that explain the data as well [s], as those of a periodic motion do.
         recorded: lag according to the recording [s], minus its clock_offset.
         misfit: mean distance from rigid motion with the gripper at the minimum [m].
         candidates: [N] s, the lags that were tried.
@@ -49,6 +52,7 @@ class LagEstimate:
     value: float
     std: float
     is_determined: bool
+    rivals: tuple[float, ...]
     recorded: float
     misfit: float
     candidates: np.ndarray
@@ -67,18 +71,23 @@ class LagEstimate:
 
 
 def estimate_lag(
-    recording: Recording, paths: dict[str, GripperPath], use: Mapping[str, np.ndarray] = MappingProxyType({})
+    recording: Recording,
+    paths: dict[str, GripperPath],
+    use: Mapping[str, np.ndarray] = MappingProxyType({}),
+    is_one_clock: bool = True,
 ) -> LagEstimate | None:
     """Estimate the lag of the markers, or of the clouds if there are none; None without motion or observations.
 
     Observed points near a gripper are assumed to be fixed to it: x(t) = p(t - lag) + R(t - lag) b with a constant b.
     The markers or cloud points nearest to the gripper are used. The lag minimises the mean soft absolute value of the
-    residuals over all grippers.
+    residuals over all grippers. Of several minima that the data cannot tell apart, it is the one nearest to the
+    recorded lag, if all stamps are on one clock. A periodic motion has a minimum in each period.
 
     Args:
         recording: the episode.
         paths: of its grippers.
         use: [T] bool for "markers" and "points", frames that are not rejected.
+        is_one_clock: whether the stamps are on one clock; else the recorded lag means nothing.
     """
     kind = "markers" if recording.markers is not None else "points"
     stream = getattr(recording, kind)
@@ -91,11 +100,16 @@ def estimate_lag(
     follower = _MarkerFollower(stream, frames) if isinstance(stream, Markers) else _CloudFollower(stream, frames)
     t = stream.t[frames]
     candidates = _symmetric_grid(LAG_SEARCH_RANGE_S, COARSE_LAG_STEP_S) - recording.clock_offset
-    cost = _frame_mean(_curve(follower, paths, t, candidates))
-    candidates, cost = candidates[np.isfinite(cost)], cost[np.isfinite(cost)]
-    if len(cost) < MIN_SAMPLES:
+    recorded = 0.0 - recording.clock_offset
+    curve = _curve(follower, paths, t, candidates)
+    is_covered = np.isfinite(_frame_mean(curve))
+    candidates, curve = candidates[is_covered], curve[:, is_covered]
+    if len(candidates) < MIN_SAMPLES:
         return None
-    best = int(np.argmin(cost))
+    cost = _frame_mean(curve)
+    minima = _find_equal_minima(candidates, curve, cost)
+    best = min(minima, key=lambda k: abs(candidates[k] - recorded) if is_one_clock else cost[k])
+    rivals = tuple(float(candidates[k]) for k in minima if k != best)
     fine_candidates = candidates[best] + _symmetric_grid(FINE_LAG_RANGE_S, FINE_LAG_STEP_S)
     fine = _curve(follower, paths, t, fine_candidates)
     level = cost[best] + VALLEY_FRACTION * (np.median(cost) - cost[best])
@@ -110,11 +124,34 @@ def estimate_lag(
     std = float(np.hypot(jackknife, misfit / max(_velocity_scatter(paths, t - value) * np.sqrt(len(t)), 1e-9)))
     is_interior = 0 < best < len(candidates) - 1
     is_determined = bool(is_interior and std < MAX_LAG_STD_S and np.median(cost) > MIN_COST_CONTRAST * cost[best])
-    return LagEstimate(value, std, is_determined, 0.0 - recording.clock_offset, misfit, candidates, cost)
+    return LagEstimate(value, std, is_determined, rivals, recorded, misfit, candidates, cost)
 
 
 def _symmetric_grid(half_range: float, step: float) -> np.ndarray:
     return np.arange(-half_range, half_range + step / 2, step)
+
+
+def _find_equal_minima(candidates: np.ndarray, curve: np.ndarray, cost: np.ndarray) -> list[int]:
+    """Return the index of the smallest misfit, and of other minima whose misfit may be larger by chance alone.
+
+    The test flips the signs of the differences between blocks of frames.
+
+    Args:
+        candidates: [N] s.
+        curve: [F, N] m, misfit of each frame.
+        cost: [N] m, its mean over the frames.
+    """
+    best = int(np.argmin(cost))
+    minima, signs = [best], np.array(list(product((-1, 1), repeat=JACKKNIFE_BLOCKS)))
+    for k in 1 + np.flatnonzero((cost[1:-1] < cost[:-2]) & (cost[1:-1] <= cost[2:])):
+        difference = curve[:, k] - curve[:, best]
+        difference = difference[np.isfinite(difference)]
+        if abs(candidates[k] - candidates[best]) <= FINE_LAG_RANGE_S or len(difference) < JACKKNIFE_BLOCKS:
+            continue  # the same minimum, or nothing to compare
+        blocks = np.array([block.mean() for block in np.array_split(difference, JACKKNIFE_BLOCKS)])
+        if (signs @ blocks >= blocks.sum()).mean() > MAX_RIVAL_P_VALUE:
+            minima.append(int(k))
+    return minima
 
 
 class _MarkerFollower:
