@@ -40,14 +40,13 @@ def curvature_stencils(mesh: Mesh) -> CurvatureStencils:
     The ring is unfolded by laying the triangles' rest shapes edge to edge, so seams and folded garments are no special
     case. Axes are those of the vertex's first triangle.
     """
-    beyond = _triangles_beyond(mesh)
-    spokes = _spokes(mesh, beyond)
-    rows = [_fit(patch) for patch in (_determining_ring(v, spokes[v], beyond) for v in range(len(mesh.vertices)))]
-    depth = max(len(near) for near, _ in rows)
-    stencil = np.repeat(np.arange(len(rows))[:, None], depth, axis=1)
-    weight = np.zeros((len(rows), depth, 5))
-    for v, (near, w) in enumerate(rows):
-        stencil[v, : len(near)], weight[v, : len(near)] = near, w
+    rings = _determining_rings(mesh)
+    depth = max(map(len, rings))
+    stencil = np.repeat(np.arange(len(rings))[:, None], depth, axis=1)
+    weight = np.zeros((len(rings), depth, 5))
+    for group, places in _group_by_size(rings):
+        size = places.shape[1]
+        stencil[group, :size], weight[group, :size] = [list(rings[v]) for v in group], _fit(places)
     return CurvatureStencils(stencil, weight[..., :3], weight[..., 3:])
 
 
@@ -158,7 +157,7 @@ def _triangles_beyond(mesh: Mesh) -> dict[tuple[int, int], tuple[int, complex]]:
     return out
 
 
-def _spokes(mesh: Mesh, beyond) -> list[dict[int, complex]]:
+def _spokes(mesh: Mesh) -> list[dict[int, complex]]:
     """Return for each vertex its edges that start a triangle, in that triangle's material axes."""
     rest = mesh.rest[..., 0] + 1j * mesh.rest[..., 1]
     out: list[dict[int, complex]] = [{} for _ in mesh.vertices]
@@ -193,17 +192,40 @@ def _fan(v: int, start: int, beyond) -> tuple[list[int], list[complex], bool]:
     return ring, ratios, False
 
 
-def _determining_ring(v: int, spokes: dict[int, complex], beyond) -> dict[int, complex]:
-    """Return unfolded neighbours of ``v``, enough for a quadratic if the mesh has them."""
-    place = _ring(v, spokes, beyond)
-    edges = [(a, beyond[v, a][0]) for a in place if (v, a) in beyond]
+def _determining_rings(mesh: Mesh) -> list[dict[int, complex]]:
+    """Return unfolded neighbours of each vertex, enough for a quadratic if the mesh has them."""
+    beyond = _triangles_beyond(mesh)
+    rings = [_ring(v, spokes, beyond) for v, spokes in enumerate(_spokes(mesh))]
+    edges = [[(a, beyond[v, a][0]) for a in ring if (v, a) in beyond] for v, ring in enumerate(rings)]
+    undetermined = np.arange(len(rings))
     for _ in range(MAX_RING_GROWTHS):
-        singular = np.linalg.svd(_design(np.array(list(place.values())))[0], compute_uv=False)
-        if len(singular) == 3 and singular[2] > MIN_SINGULAR_VALUE_RATIO * singular[0]:
-            break
-        edges, place = _grown(edges, {v: 0j, **place}, beyond)
-        del place[v]
-    return place
+        groups = _group_by_size([rings[v] for v in undetermined])
+        parts = [undetermined[group[~_determines_quadratic(places)]] for group, places in groups]
+        undetermined = np.concatenate([*parts, undetermined[:0]])
+        for v in undetermined.tolist():
+            edges[v], rings[v] = _grown(edges[v], {v: 0j, **rings[v]}, beyond)
+            del rings[v][v]
+    return rings
+
+
+def _group_by_size(rings: list[dict[int, complex]]) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Return groups of equally large rings: their indices [B], and the places of their neighbours [B, N]."""
+    sizes = np.array([len(ring) for ring in rings], dtype=int)
+    groups = [np.flatnonzero(sizes == size) for size in np.unique(sizes)]
+    return [(group, np.array([list(rings[v].values()) for v in group])) for group in groups]
+
+
+def _determines_quadratic(places: np.ndarray) -> np.ndarray:
+    """Return whether each ring of ``places`` [B, N] determines a quadratic.
+
+    The linear part is taken out of the quadratic terms first. That keeps linear functions free of curvature where the
+    quadratic is undetermined.
+    """
+    _, _, quadratic, project, _ = _split(places)
+    singular = np.linalg.svd(project @ quadratic, compute_uv=False)
+    if singular.shape[1] < 3:
+        return np.zeros(len(places), bool)
+    return singular[:, 2] > MIN_SINGULAR_VALUE_RATIO * singular[:, 0]
 
 
 def _grown(edges: list[tuple[int, int]], place: dict[int, complex], beyond):
@@ -217,40 +239,34 @@ def _grown(edges: list[tuple[int, int]], place: dict[int, complex], beyond):
     return outer, place
 
 
-def _design(z: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
-    """Weighted columns of the quadratic terms without their linear part [N, 3], what maps values to them, the length.
+def _split(places: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Return what fits quadratics to values at places [B, N].
 
-    Taking the linear part out first keeps linear functions free of curvature where the quadratic is undetermined.
+    It is the weights of the rows [B, N], what maps weighted values to the linear part [B, 2, N], quadratic columns
+    [B, N, 3] unweighted, what maps values to the weighted remainder [B, N, N], and units of length [B].
     """
-    _, _, quadratic, project, length = _split(z)
-    return project @ quadratic, project, length
-
-
-def _split(z: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, float]:
-    """Weights of the rows [N, N], what maps weighted values to the linear part [2, N], quadratic columns [N, 3]
-    unweighted, what maps values to the weighted remainder [N, N], and the unit of length.
-    """
-    length = float(np.abs(z).mean())
-    x, y = np.real(z) / length, np.imag(z) / length
-    root = np.diag(1 / (x * x + y * y))
-    linear = root @ np.stack([x, y], axis=-1)
+    length = np.abs(places).mean(1)
+    x, y = np.real(places) / length[:, None], np.imag(places) / length[:, None]
+    root = 1 / (x * x + y * y)
+    linear = root[..., None] * np.stack([x, y], axis=-1)
     slope = np.linalg.pinv(linear)
-    project = (np.eye(len(z)) - linear @ slope) @ root
+    project = (np.eye(places.shape[1]) - linear @ slope) * root[:, None]
     # with sqrt 2 wf as the third unknown, turned material axes turn the unknowns: the fit does not depend on them
     return root, slope, np.stack([x * x / 2, y * y / 2, x * y / 2**0.5], axis=-1), project, length
 
 
-def _fit(patch: dict[int, complex]) -> tuple[list[int], np.ndarray]:
-    """Return neighbours and their weights [N, 5]: of the second derivatives, then of the first."""
-    root, slope, quadratic, project, length = _split(np.array(list(patch.values())))
+def _fit(places: np.ndarray) -> np.ndarray:
+    """Return the weights [B, N, 5] of neighbours at places [B, N]: of the second derivatives, then of the first."""
+    root, slope, quadratic, project, length = _split(places)
     left, singular, right = np.linalg.svd(project @ quadratic, full_matrices=False)
     is_determined = (
-        singular > MIN_SINGULAR_VALUE_RATIO / 20 * len(patch) ** 0.5
+        singular > MIN_SINGULAR_VALUE_RATIO / 20 * places.shape[1] ** 0.5
     )  # before the linear part went, every row had length 1/2
     inverse = np.where(is_determined, 1 / np.where(is_determined, singular, 1.0), 0.0)
-    second = (right.T * inverse) @ left.T @ project
-    first = slope @ root @ (np.eye(len(patch)) - quadratic @ second)
-    return list(patch), np.concatenate([second / length**2, first / length]).T
+    second = (right.swapaxes(1, 2) * inverse[:, None]) @ left.swapaxes(1, 2) @ project
+    first = (slope * root[:, None]) @ (np.eye(places.shape[1]) - quadratic @ second)
+    length = length[:, None, None]
+    return np.concatenate([second / length**2, first / length], axis=1).swapaxes(1, 2)
 
 
 def _cotangents(mesh: Mesh) -> np.ndarray:
