@@ -32,6 +32,10 @@ class SolverSettings:
             moves. One ends it if exact slopes asked for a longer step, and only its damped rest went downhill: another
             one would be damped as much.
         broyden_tolerance: relative error of the predicted decrease up to which an updated Jacobian is good enough.
+        min_gain_to_double: actual over predicted decrease, from which a step is doubled. Tangents along which ripples
+            move overestimate the curvature of the cost, and a simulation costs far less than another linearisation.
+        min_decrease_to_double: decrease of the cost, from which a step is worth another simulation.
+        max_doublings: of one step.
     """
 
     initial_damping: float = 1e-3
@@ -44,6 +48,9 @@ class SolverSettings:
     max_misled_steps: int = 4
     max_small_steps: int = 2
     broyden_tolerance: float = 0.1
+    min_gain_to_double: float = 1.25
+    min_decrease_to_double: float = 0.05
+    max_doublings: int = 3
 
 
 @dataclass(frozen=True)
@@ -178,6 +185,22 @@ class Iterate(NamedTuple):
         return weight * huber(z, cutoff)[1] / scale**2, z
 
 
+class TrialStep(NamedTuple):
+    """A step that was evaluated.
+
+    Attributes:
+        step: [K].
+        residual: [R] there.
+        error_group: [R] there.
+        decrease: of the robust cost.
+    """
+
+    step: Tensor
+    residual: Tensor
+    error_group: Tensor
+    decrease: float
+
+
 def minimise(
     problem: Problem,
     start: Tensor,
@@ -241,21 +264,40 @@ def _step(
 ) -> tuple[Iterate | None, float, float]:
     """(accepted point or None, actual over predicted decrease, next damping)."""
     gradient, hessian = normal_equations(problem, at)
-    cost_here = robust_cost(problem, at, at.raw, at.linear.residual)
     low, high = _step_bounds(problem, at)
     for _ in range(settings.max_trials):
         step = solve_box_qp(hessian + damping * torch.diag(hessian.diagonal()), -gradient, low, high)
-        raw = at.raw + step
-        residual, error_group = _try_evaluate(problem, raw)
-        if residual is not None:
+        trial = _try_step(problem, at, step)
+        if trial is not None and trial.decrease > 0:
             predicted = -float(gradient @ step + 0.5 * step @ hessian @ step)
-            decrease = cost_here - robust_cost(problem, at, raw, residual)
-            if decrease > 0:
-                gain_ratio = decrease / max(predicted, 1e-12)
-                trial = _broyden_update(problem, at, raw, step, residual, error_group)
-                return trial, gain_ratio, max(damping / settings.damping_decrease, settings.min_damping)
+            gain_ratio = trial.decrease / max(predicted, 1e-12)
+            if gain_ratio > settings.min_gain_to_double and trial.decrease > settings.min_decrease_to_double:
+                trial = _extend_step(problem, at, trial, settings.max_doublings)
+            damping = max(damping / settings.damping_decrease, settings.min_damping)
+            return _broyden_update(problem, at, trial), gain_ratio, damping
         damping = max(settings.damping_increase * damping, settings.min_damping_after_rejection)
     return None, 0.0, damping
+
+
+def _try_step(problem: Problem, at: Iterate, step: Tensor) -> TrialStep | None:
+    """Evaluate a step; None where the simulation fails."""
+    try:
+        residual, error_group = problem.evaluate(at.raw + step)
+    except (SimulationDiverged, UnstableStep):
+        return None
+    cost_here = robust_cost(problem, at, at.raw, at.linear.residual)
+    return TrialStep(step, residual, error_group, cost_here - robust_cost(problem, at, at.raw + step, residual))
+
+
+def _extend_step(problem: Problem, at: Iterate, trial: TrialStep, max_doublings: int) -> TrialStep:
+    """Double a step for as long as the cost falls farther."""
+    low, high = _step_bounds(problem, at)
+    for _ in range(max_doublings):
+        longer = _try_step(problem, at, (2 * trial.step).clamp(low, high))
+        if longer is None or not longer.decrease > trial.decrease:
+            break
+        trial = longer
+    return trial
 
 
 def _step_bounds(problem: Problem, at: Iterate) -> tuple[Tensor, Tensor]:
@@ -264,20 +306,12 @@ def _step_bounds(problem: Problem, at: Iterate) -> tuple[Tensor, Tensor]:
     return low, high
 
 
-def _try_evaluate(problem: Problem, raw: Tensor) -> tuple[Tensor | None, Tensor | None]:
-    try:
-        return problem.evaluate(raw)
-    except (SimulationDiverged, UnstableStep):
-        return None, None
-
-
-def _broyden_update(
-    problem: Problem, at: Iterate, raw: Tensor, step: Tensor, residual: Tensor, error_group: Tensor | None
-) -> Iterate:
-    prediction_error = residual - at.linear.residual - at.linear.jacobian @ step
+def _broyden_update(problem: Problem, at: Iterate, trial: TrialStep) -> Iterate:
+    step = trial.step
+    prediction_error = trial.residual - at.linear.residual - at.linear.jacobian @ step
     jacobian = at.linear.jacobian + torch.outer(prediction_error, step) / (step @ step)
-    linear = at.linear._replace(residual=residual, jacobian=jacobian, error_group=error_group)
-    return _iterate(problem, raw, linear, exact=False)
+    linear = at.linear._replace(residual=trial.residual, jacobian=jacobian, error_group=trial.error_group)
+    return _iterate(problem, at.raw + step, linear, exact=False)
 
 
 def evaluate_point(problem: Problem, raw: Tensor, linear: Linearised) -> Iterate:
