@@ -55,12 +55,21 @@ def make_rugged(refused=lambda raw: False):
         linearise, evaluate, lambda raw: torch.stack([raw[0], raw[1].clamp(min=0)]), start, std, torch.ones(2), 0.01
     )
 
-    def observer_problem(raw):
+    def simulate_fabrics(raw, fabrics):
+        return [None if refused(fabric) else [] for fabric in fabrics]
+
+    def observer_problem(raw, simulated):
         return problem._replace(
             linearise=lambda at: linearise(at)._replace(jacobian=torch.zeros(len(phase), 2)), prior_mean=raw
         )
 
-    objective = SimpleNamespace(unknowns=unknowns, problem=lambda: problem, observer_problem=observer_problem)
+    objective = SimpleNamespace(
+        unknowns=unknowns,
+        problem=lambda: problem,
+        observer_problem=observer_problem,
+        simulate_cloth=lambda raw: [],
+        simulate_fabrics=simulate_fabrics,
+    )
     return objective, start, truth
 
 
@@ -92,7 +101,7 @@ def test_errors_of_the_observer_need_one_simulation(model, brief):
     nuisances = select_nuisances(["clock", "camera"], ["rim"])
     objective = Objective(model, unknowns, [build_episode(model, brief)], nuisances=nuisances)
     start, count = objective.start, len(unknowns)
-    problem = objective.observer_problem(start)
+    problem = objective.observer_problem(start, objective.simulate_cloth(start))
     at = start + torch.cat([torch.zeros(count), 0.5 * objective.prior_std[count:]])
     linear, full = problem.linearise(at), objective.linearise(at)
     is_close = torch.isclose(linear.jacobian[:, count:], full.jacobian[:, count:], rtol=1e-6, atol=1e-9).all(1)
@@ -102,3 +111,16 @@ def test_errors_of_the_observer_need_one_simulation(model, brief):
     end = levenberg_marquardt.minimise(problem, at, 3, lambda at: False)
     assert torch.equal(end.raw[:count], start[:count])
     assert not torch.equal(end.raw[count:], at[count:])
+
+
+def test_fabrics_that_share_a_batch_move_as_they_do_alone(model, brief):
+    """Their substep is that of the stiffest; one that cannot be simulated takes no other along."""
+    unknowns = collect_unknowns(model, ["youngs_modulus", "air.normal"], None)
+    objective = Objective(model, unknowns, [build_episode(model, brief)])
+    fabrics = objective.start + torch.tensor([[0.0, 0.0], [0.5, 0.1], [60.0, 0.0], [-0.5, 0.3]], dtype=torch.float64)
+    together = objective.simulate_fabrics(objective.start, fabrics)
+    assert together[2] is None  # no substep is short enough
+    for k in (0, 1, 3):
+        alone = objective.simulate_cloth(fabrics[k])
+        for seen, expected in zip(together[k], alone, strict=True):
+            torch.testing.assert_close(seen.x, expected.x, rtol=0, atol=2e-5)

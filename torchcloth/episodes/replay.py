@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from contextlib import suppress
+from operator import itemgetter
 from typing import NamedTuple
 
 import torch
@@ -11,6 +13,7 @@ from torch import Tensor, nn
 
 from .._utils.linalg import differentiate_hermite, interpolate_hermite
 from ..cloth import Cloth
+from ..errors import SimulationDiverged, UnstableStep
 from ..parameters import call_with_parameters
 from ..simulation.sensitivities import Directions
 from ..types import ClothState, Rollout
@@ -18,6 +21,7 @@ from .observed import Episode
 from .unknowns import Unknown, make_state_entries
 
 SETTLE_TIME_S = 0.3  # in which the noise of measured positions is damped out
+SCENES_PER_BATCH = 8  # float64 lanes of the widest packs
 
 
 class Frames(NamedTuple):
@@ -76,6 +80,47 @@ def simulate(
     values = make_state_entries(unknowns, raw)
     entries = {f"cloth.{key}": value.to(episode.initial) for key, value in values.items()}
     return frames_from_rollout(call_with_parameters(Replay(cloth), entries, (episode, dt)))
+
+
+@torch.no_grad()
+def simulate_all(
+    cloth: Cloth, unknowns: Sequence[Unknown], raw: Tensor, episode: Episode, dt: float | None = None
+) -> list[Frames | None]:
+    """Simulate the episode at N points ``raw`` [N, K] of the unknowns; None where a simulation fails.
+
+    Points share batches, whose substep is that of the stiffest one. So those with similar steps go together.
+    """
+    out: list[Frames | None] = [None] * len(raw)
+    order = torch.tensor([_stable_step(cloth, unknowns, point) for point in raw]).argsort()
+    for part in (order[first : first + SCENES_PER_BATCH] for first in range(0, len(raw), SCENES_PER_BATCH)):
+        with suppress(SimulationDiverged, UnstableStep):
+            frames = simulate(cloth, unknowns, raw[part][:, None], episode, dt)
+            for k, i in enumerate(part.tolist()):
+                out[i] = map_frames(frames, itemgetter(k))
+            continue
+        for i in part.tolist() if len(part) > 1 else ():  # one of them failed, and took the others along
+            with suppress(SimulationDiverged, UnstableStep):
+                out[i] = simulate(cloth, unknowns, raw[i], episode, dt)
+    return out
+
+
+def _stable_step(cloth: Cloth, unknowns: Sequence[Unknown], raw: Tensor) -> float:
+    """Return the stable substep [s] at a point; 0 where there is none."""
+    entries = make_state_entries(unknowns, raw.to(cloth.areal_density.raw))
+    values = {f"cloth.{key}": value for key, value in entries.items()}
+    try:
+        return call_with_parameters(_StableStep(cloth), values, ())
+    except UnstableStep:
+        return 0.0
+
+
+class _StableStep(nn.Module):
+    def __init__(self, cloth: Cloth) -> None:
+        super().__init__()
+        self.cloth = cloth
+
+    def forward(self) -> float:
+        return self.cloth.stable_step()
 
 
 def simulate_with_tangents(

@@ -9,14 +9,14 @@ follows.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-from ...errors import SimulationDiverged, UnstableStep
+from ...episodes.replay import Frames
 from . import levenberg_marquardt
 from .multistart import comparable_costs
 from .objective import Objective
@@ -113,18 +113,18 @@ def search_by_draws(
     count = max(2, settings.draws_per_unknown * len(axes))
     mean = torch.tensor([axis.to_place(float(start[axis.index])) for axis in axes], dtype=torch.float64)
     std = torch.tensor([axis.std for axis in axes], dtype=torch.float64)
-    best = Draw(mean, _fit_observer(objective, start))
+    best = Draw(mean, _fit_observer(objective, start, objective.simulate_cloth(start)))
     for round_index in range(settings.rounds):
         draws = [best]
         offsets = torch.randn(count - 1, len(axes), generator=generator, dtype=torch.float64)
-        for place in [mean, *(mean + std * offset for offset in offsets)]:
-            raw = best.at.raw.clone()
-            for axis, coordinate in zip(axes, place.tolist(), strict=True):
-                raw[axis.index] = axis.from_place(coordinate)
-            try:
-                draws.append(Draw(place, _fit_observer(objective, raw)))
-            except (SimulationDiverged, UnstableStep):
-                continue
+        places = torch.cat([mean[None], mean + std * offsets])
+        points = best.at.raw.repeat(len(places), 1)
+        for axis, column in zip(axes, places.T.tolist(), strict=True):
+            points[:, axis.index] = torch.tensor([axis.from_place(coordinate) for coordinate in column])
+        simulated = objective.simulate_fabrics(best.at.raw, points[:, : len(objective.unknowns)])
+        for place, raw, frames in zip(places, points, simulated, strict=True):
+            if frames is not None:
+                draws.append(Draw(place, _fit_observer(objective, raw, frames)))
         costs = comparable_costs(problem, [draw.at for draw in draws])
         order = sorted(range(len(draws)), key=costs.__getitem__)[: max(2, round(settings.elite_fraction * count))]
         best, elite = draws[order[0]], torch.stack([draws[i].place for i in order])
@@ -135,9 +135,9 @@ def search_by_draws(
     return best.at.raw
 
 
-def _fit_observer(objective: Objective, raw: Tensor) -> levenberg_marquardt.Iterate:
+def _fit_observer(objective: Objective, raw: Tensor, simulated: Sequence[Frames]) -> levenberg_marquardt.Iterate:
     """Take one Gauss-Newton step of what the observer gets wrong, with the cloth as it moves at ``raw`` [K]."""
-    return levenberg_marquardt.minimise(objective.observer_problem(raw), raw, 1, lambda at: False)
+    return levenberg_marquardt.take_step(objective.observer_problem(raw, simulated), raw)
 
 
 def _list_axes(objective: Objective, settings: CrossEntropySettings) -> list[Axis]:

@@ -259,6 +259,13 @@ def minimise(
     return last._replace(converged=converged)
 
 
+def take_step(problem: Problem, start: Tensor, settings: SolverSettings = SOLVER_SETTINGS) -> Iterate:
+    """Take one step from ``start`` [K]; at its end the Jacobian is an update. Where no step helps, stay there."""
+    at = _linearise(problem, start)
+    trial, *_ = _step(problem, at, settings.initial_damping, settings)
+    return at if trial is None else trial
+
+
 def _step(
     problem: Problem, at: Iterate, damping: float, settings: SolverSettings
 ) -> tuple[Iterate | None, float, float]:

@@ -17,7 +17,7 @@ from ...episodes.cloth_fingerprint import cloth_fingerprint_parts
 from ...episodes.grip_patch_mesh import GrippedCloths, StretchedCloth
 from ...episodes.observed import Episode
 from ...episodes.observed_surface import build_surface
-from ...episodes.replay import Frames, StateModes, map_frames, see_at, simulate, simulate_with_tangents
+from ...episodes.replay import Frames, StateModes, map_frames, see_at, simulate, simulate_all, simulate_with_tangents
 from ...episodes.unknowns import Unknown
 from ...errors import InvalidInput, SimulationDiverged, UnstableStep
 from ...parameters import PhysicalParameter
@@ -285,6 +285,31 @@ class Objective:
             return simulate(cloth, self.unknowns, fabric, episode, self.dt)
         return stretched.view(simulate(cloth, self.unknowns, fabric, stretched.take_start(episode), self.dt))
 
+    @torch.no_grad()
+    def simulate_cloth(self, raw: Tensor) -> list[Frames]:
+        """Simulate all episodes as an observer without errors sees them."""
+        return [self._simulate_cloth(raw, i) for i in range(len(self.episodes))]
+
+    def simulate_fabrics(self, raw: Tensor, fabrics: Tensor) -> list[list[Frames] | None]:
+        """Simulate all episodes with other fabrics, as ``simulate_cloth`` does.
+
+        Args:
+            raw: [K], whose nuisances count.
+            fabrics: [N, U] the fabrics' unknowns.
+
+        Returns:
+            For each fabric the frames of all episodes; None where a simulation fails.
+        """
+        by_episode = [self._simulate_fabrics(raw, fabrics, i) for i in range(len(self.episodes))]
+        return [None if None in frames else list(frames) for frames in zip(*by_episode, strict=True)]
+
+    def _simulate_fabrics(self, raw: Tensor, fabrics: Tensor, i: int) -> list[Frames | None]:
+        (cloth, stretched), episode = self._gripped_cloth(raw, i), self._initial_episode(raw, i)
+        if stretched is None:
+            return simulate_all(cloth, self.unknowns, fabrics, episode, self.dt)
+        frames = simulate_all(stretched.cloth, self.unknowns, fabrics, stretched.take_start(episode), self.dt)
+        return [None if f is None else stretched.view(f) for f in frames]
+
     def _gripped_cloth(self, raw: Tensor, i: int) -> tuple[Cloth, StretchedCloth | None]:
         """Return the cloth as it is gripped in episode ``i``, and where the pattern is stretched for that."""
         return self._gripped_cloths.grip(self._grip_extents(raw, i))
@@ -380,24 +405,31 @@ class Objective:
         self, raw: Tensor, i: int, frames: Frames, derivatives: Frames, steps: Mapping[int, float]
     ) -> None:
         """Write finite slopes by some unknowns into derivatives [K, ...] of episode ``i``."""
-        for k, size in steps.items():
-            step, there = self._simulate_shifted(raw, i, k, size)
-            if there is None:
-                continue
+        for k, (step, there) in self._simulate_shifted(raw, i, steps).items():
             derivatives.x[k], derivatives.v[k] = (there.x - frames.x) / step, (there.v - frames.v) / step
             for name, wrench in derivatives.wrench.items():
                 wrench[k] = (there.wrench[name] - frames.wrench[name]) / step
 
     @torch.no_grad()
-    def _simulate_shifted(self, raw: Tensor, i: int, k: int, size: float) -> tuple[float, Frames | None]:
-        """(step of unknown ``k``, frames there), backwards where forwards fails; (0, None) where both fail."""
-        for step in (size, -size):
-            shifted = raw.detach().clone()
-            shifted[k] += step
-            if torch.equal(self.clip(shifted), shifted):
+    def _simulate_shifted(self, raw: Tensor, i: int, sizes: Mapping[int, float]) -> dict[int, tuple[float, Frames]]:
+        """Simulate one step of each of some unknowns, by index, backwards where forwards fails.
+
+        Returns:
+            The step and the frames there; nothing where both fail.
+        """
+        out: dict[int, tuple[float, Frames]] = {}
+        for sign in (1, -1):
+            steps = {k: sign * size for k, size in sizes.items() if k not in out}
+            shifted = {k: raw.detach().index_add(0, torch.tensor(k), raw.new_tensor([d])) for k, d in steps.items()}
+            legal = {k: point for k, point in shifted.items() if torch.equal(self.clip(point), point)}
+            fabrics = [k for k in legal if k < len(self.unknowns)]
+            points = torch.stack([raw, *(legal[k] for k in fabrics)])[1:, : len(self.unknowns)]
+            simulated = dict(zip(fabrics, self._simulate_fabrics(raw, points, i), strict=True))
+            for k in legal.keys() - set(fabrics):
                 with suppress(SimulationDiverged, UnstableStep):
-                    return step, self._simulate_cloth(shifted, i)
-        return 0.0, None
+                    simulated[k] = self._simulate_cloth(legal[k], i)
+            out |= {k: (steps[k], there) for k, there in simulated.items() if there is not None}
+        return out
 
     def _observe_with_derivatives(
         self, raw: Tensor, i: int, frames: Frames, derivatives: Frames
@@ -451,14 +483,17 @@ class Objective:
         """Rows of what an observer with errors sees of simulated episodes and their derivatives."""
         return self._rows([self._observe_with_derivatives(raw, i, *pair) for i, pair in enumerate(simulated)])
 
-    def observer_problem(self, raw: Tensor) -> levenberg_marquardt.Problem:
-        """Return the problem of the observer's errors, of cloth that moves as at ``raw``: one simulation is enough."""
+    def observer_problem(self, raw: Tensor, simulated: Sequence[Frames]) -> levenberg_marquardt.Problem:
+        """Return the problem of the observer's errors, of cloth that moves as at ``raw``.
+
+        Args:
+            raw: [K].
+            simulated: frames of all episodes there, as ``simulate_cloth`` returns them.
+        """
         self._count_simulations(raw)
         is_observers = torch.zeros(len(raw), dtype=torch.bool)
         for s in (s for slices in self.nuisance_slices for s in slices if not s.nuisance.acts_on_cloth):
             is_observers[s.index] = True
-        with torch.no_grad():
-            simulated = [self._simulate_cloth(raw, i) for i in range(len(self.episodes))]
 
         def linearise(at: Tensor) -> levenberg_marquardt.Linearised:
             none = [map_frames(frames, lambda x: x.new_zeros(len(raw), *x.shape)) for frames in simulated]
