@@ -21,7 +21,7 @@ from .observed import Episode
 from .unknowns import Unknown, make_state_entries
 
 SETTLE_TIME_S = 0.3  # in which the noise of measured positions is damped out
-SCENES_PER_BATCH = 8  # float64 lanes of the widest packs
+SIMULATIONS_PER_BATCH = 8  # float64 lanes of the widest packs
 
 
 class Frames(NamedTuple):
@@ -92,7 +92,7 @@ def simulate_all(
     """
     out: list[Frames | None] = [None] * len(raw)
     order = torch.tensor([_stable_step(cloth, unknowns, point) for point in raw]).argsort()
-    for part in (order[first : first + SCENES_PER_BATCH] for first in range(0, len(raw), SCENES_PER_BATCH)):
+    for part in (order[first : first + SIMULATIONS_PER_BATCH] for first in range(0, len(raw), SIMULATIONS_PER_BATCH)):
         with suppress(SimulationDiverged, UnstableStep):
             frames = simulate(cloth, unknowns, raw[part][:, None], episode, dt)
             for k, i in enumerate(part.tolist()):
