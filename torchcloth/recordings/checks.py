@@ -136,7 +136,8 @@ def normalise_unit(vectors: np.ndarray, place: str) -> np.ndarray:
     Raises:
         RecordingError: a length differs from one by more than ``UNIT_TOLERANCE``.
     """
-    length = np.linalg.norm(vectors, axis=-1, keepdims=True)
+    with np.errstate(over="ignore"):  # a length that overflows is not one
+        length = np.linalg.norm(vectors, axis=-1, keepdims=True)
     off = np.abs(length - 1)
     if off.max() > UNIT_TOLERANCE:
         worst = int(np.argmax(off))
