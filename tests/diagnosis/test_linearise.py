@@ -95,8 +95,7 @@ def test_steps_end_at_bounds_and_slopes_know_it(made):
     near, _, back = (
         linearise(end, setting, (), shifts=[(place, s * step)]).bins[0].jacobian[:, 0] for s in (0.5, 1.0, -1.0)
     )
-    assert not near.any()
-    assert back.any()
+    assert near.abs().max() < 1e-9 * back.abs().max()
     short = end.at_point(end.point - 0.25 * step * torch.eye(len(end.point)).double()[place])
     on, off = (linearise(short, setting, (), shifts=[(place, s * step)]).bins[0].jacobian[:, 0] for s in (1.0, 0.25))
     assert torch.allclose(on, off, rtol=1e-9, atol=0.0)  # both end at the bound, and are divided by the way to there

@@ -16,6 +16,7 @@ from ...episodes.observed import Episode
 from ...episodes.replay import Frames
 from ...episodes.steps import clip_step
 from ...episodes.world import Hypothesis, World
+from ...episodes.world_batches import WorldRun, group_runs, simulate_group
 from ...episodes.world_cache import WorldCache, none_if_impossible
 from ...identification.nuisances import CameraOffset, ClockOffset, ForceTare, GraspOffset, RimOffset
 from ..data.binning import (
@@ -167,29 +168,26 @@ def run_episode(
     """
     world = worlds.base
     shifted = [
-        partial(w.simulate_observed, *(fine_episode if on_fine and fine_episode else (e, dt)))
+        WorldRun(w, *(fine_episode if on_fine and fine_episode else (e, dt)))
         for w, on_fine in zip(worlds.shifted, worlds.shifted_on_fine_mesh, strict=True)
     ]
     modes = GraspOffset().initial_shape_modes(world.cloth, e) if with_grasp_shifts else ()
-    grasps = [
-        partial(world.simulate_observed, replace(e, initial=e.initial + GRASP_STD_M * mode), dt) for mode in modes
-    ]
+    grasps = [WorldRun(world, replace(e, initial=e.initial + GRASP_STD_M * mode), dt) for mode in modes]
     changed = [worlds.with_typical(h) for h in hypotheses]
     # only what changes more than the observer is simulated again
     needs_run = [
         c is not None and (c.cloth is not world.cloth or c.motion_transforms is not world.motion_transforms)
         for c in changed
     ]
-    fine_jobs = [partial(worlds.observe, *fine_episode, fine=True)] if with_fine and fine_episode else []  # the longest
-    jobs = [*fine_jobs, partial(worlds.simulate, e, dt), *shifted, *grasps]
-    hypothesis_jobs = [
-        partial(none_if_impossible, partial(c.simulate_observed, e, dt))
-        for c, run in zip(changed, needs_run, strict=True)
-        if c and run
+    hypothesis_runs = [
+        WorldRun(c, e, dt, may_fail=True) for c, run in zip(changed, needs_run, strict=True) if c and run
     ]
-    results: list[Any] = map_parallel(lambda job: job(), [*jobs, *hypothesis_jobs])
-    simulated, *others = results[len(fine_jobs) : len(jobs)]
-    hypothesis_results = iter(results[len(jobs) :])
+    fine_jobs = [partial(worlds.observe, *fine_episode, fine=True)] if with_fine and fine_episode else []  # the longest
+    results, others = _run_parallel(
+        [*fine_jobs, partial(worlds.simulate, e, dt)], [*shifted, *grasps, *hypothesis_runs]
+    )
+    simulated, count = results[-1], len(shifted) + len(grasps)
+    required, hypothesis_results = [f for f in others[:count] if f is not None], iter(others[count:])
     with_hypotheses: list[Frames | None] = []
     for c, run in zip(changed, needs_run, strict=True):
         with_hypotheses.append(
@@ -206,7 +204,7 @@ def run_episode(
         for k, frames in zip(fine_hypotheses, repeated, strict=True):
             with_hypotheses[k] = frames
     n_shifted = len(shifted)
-    return EpisodeRuns(fine, plain, others[:n_shifted], others[n_shifted:], with_hypotheses, set(fine_hypotheses))
+    return EpisodeRuns(fine, plain, required[:n_shifted], required[n_shifted:], with_hypotheses, set(fine_hypotheses))
 
 
 def _run_on_fine_mesh(
@@ -218,11 +216,19 @@ def _run_on_fine_mesh(
     """Return the episode on the fine mesh, simulated if ``fine`` is None, and the episode with each hypothesis."""
     jobs = [] if fine else [partial(worlds.observe, *fine_episode, fine=True)]
     changed = [worlds.with_typical(h, fine=True) for h in hypotheses]
-    hypothesis_jobs = [
-        partial(none_if_impossible, partial(c.simulate_observed, *fine_episode)) if c else lambda: None for c in changed
-    ]
-    results: list[Any] = map_parallel(lambda job: job(), [*jobs, *hypothesis_jobs])
-    return fine or results[0], results[len(jobs) :]
+    results, frames = _run_parallel(jobs, [WorldRun(c, *fine_episode, may_fail=True) for c in changed if c])
+    simulated = iter(frames)
+    return fine or results[0], [next(simulated) if c else None for c in changed]
+
+
+def _run_parallel(jobs: Sequence[Callable[[], Any]], runs: Sequence[WorldRun]) -> tuple[list[Any], list[Frames | None]]:
+    """Return the results of jobs, and the frames of runs; runs that differ in numbers only share a batch."""
+    groups, frames = group_runs(runs), dict[int, Frames | None]()
+    batches = [partial(simulate_group, [runs[k] for k in group]) for group in groups]
+    results: list[Any] = map_parallel(lambda job: job(), [*jobs, *batches])
+    for group, simulated in zip(groups, results[len(jobs) :], strict=True):
+        frames |= zip(group, simulated, strict=True)
+    return results[: len(jobs)], [frames[k] for k in range(len(runs))]
 
 
 def map_parallel(work: Callable[[T], U], items: Sequence[T]) -> list[U]:

@@ -1,0 +1,56 @@
+"""Worlds that differ in numbers only share a batch, and move as they do alone."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from torchcloth.diagnosis.causes.hypotheses import list_hypotheses
+from torchcloth.episodes.steps import central_steps
+from torchcloth.episodes.world_batches import WorldRun, group_runs, simulate_group
+from torchcloth.episodes.world_cache import WorldCache
+from torchcloth.errors import UnstableStep
+from torchcloth.identification.nuisances import GraspOffset
+
+MAX_DIFFERENCE_M = 5e-6  # a batch takes the shortest of its substeps
+
+
+@pytest.fixture(scope="module")
+def runs(made):
+    """Runs at shifted points, with shifted grasps, and with every hypothesis."""
+    model, data = made
+    worlds, episode = WorldCache(model, central_steps(model)), data.episodes[0]
+    shifted = [WorldRun(world, episode) for world in worlds.shifted]
+    modes = GraspOffset().initial_shape_modes(worlds.base.cloth, episode)
+    grasps = [WorldRun(worlds.base, replace(episode, initial=episode.initial + 1e-3 * mode)) for mode in modes]
+    changed = [worlds.with_typical(h) for h in list_hypotheses(model, [data.recordings[0]])]
+    return [*shifted, *grasps, *(WorldRun(world, episode, may_fail=True) for world in changed if world)]
+
+
+def test_batched_runs_are_those_of_each_alone(runs):
+    groups = group_runs(runs)
+    assert sorted(k for group in groups for k in group) == list(range(len(runs)))
+    assert len(groups) < 0.7 * len(runs)
+    for group in groups:
+        if len(group) == 1:
+            continue
+        together = simulate_group([runs[k] for k in group])
+        for k, frames in zip(group, together, strict=True):
+            alone = runs[k].simulate()
+            torch.testing.assert_close(frames.x, alone.x, rtol=0, atol=MAX_DIFFERENCE_M)
+            for name, wrench in alone.wrench.items():
+                assert (frames.wrench[name] - wrench).abs().max() < 1e-3 * wrench.abs().max()
+
+
+def test_a_run_that_fails_takes_no_other_along(runs):
+    def refuse(frames, episode):
+        raise UnstableStep("dt", got="1 s", expected="less")
+
+    good, other = runs[:2]
+    bad = good._replace(world=good.world.with_observation_transform(refuse), may_fail=True)
+    assert group_runs([good, bad, other]) == [[0, 1, 2]]
+    frames = simulate_group([good, bad, other])
+    assert frames[1] is None
+    torch.testing.assert_close(frames[0].x, good.simulate().x, rtol=0, atol=0)
+    with pytest.raises(UnstableStep):
+        simulate_group([good, bad._replace(may_fail=False)])
