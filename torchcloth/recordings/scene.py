@@ -40,15 +40,15 @@ def read_cloth(fields: Fields, folder: Folder) -> ClothInfo:
     """Read the cloth; it needs a mesh or a sheet, and if both are given they must agree."""
     mesh, start = fields.optional(fields.text, "mesh"), fields.optional(fields.text, "initial_vertices")
     velocities = fields.optional(fields.text, "initial_velocities")
-    sheet = fields.group("sheet")
-    if mesh is None and not sheet.remaining:
+    has_sheet, sheet = fields.has("sheet"), fields.group("sheet")
+    if mesh is None and not has_sheet:
         raise RecordingError(
             f"{fields.place} has no shape", expected="mesh or sheet", remedy="name cloth.obj or a sheet"
         )
     vertices, faces, uv = (None, None, None) if mesh is None else _mesh(folder, mesh)
     cloth = ClothInfo(
         **read_fabric(fields),
-        sheet=_sheet(sheet) if sheet.remaining else None,
+        sheet=_sheet(sheet) if has_sheet else None,
         vertices=vertices,
         faces=faces,
         uv=uv,
