@@ -28,12 +28,14 @@ def test_a_number_of_the_towel_holds_the_truth_or_is_not_identifiable(study, nam
     case = study[1][f"towel, {name}"]
     assert not case["refused"]
     assert case["parameters"].keys() == honesty.PARAMETER_SYMBOLS.keys()
-    assert all(holds for _, holds in honesty.identified_numbers({0: case}))
+    for fit in (case, case["exact"]):
+        assert all(holds for _, holds in honesty.identified_numbers({0: fit}))
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", TOWEL_CASES)
 def test_the_grip_or_the_first_shape_of_the_towel_is_the_likeliest_reason(study, name):
+    """Where the bench is taken as exact: else what it gets wrong is fitted, and no misfit is left."""
     assert study[1][f"towel, {name}"]["reasons"].startswith(GRIP_OR_FIRST_SHAPE)
 
 

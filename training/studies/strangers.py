@@ -25,7 +25,7 @@ from .honesty import THIS_VERSION, case_name, fit_recording, parse_comparison
 from .strangers_episodes import find_or_make_episode
 from .strangers_tables import print_tables, write_markdown
 
-BENCH_COUNT, FAST_BENCH_COUNT = 66, 1
+BENCH_COUNT, FAST_BENCH_COUNT, TOWEL_COUNT = 66, 1, 4
 BENCHES_FOLDER = "benches"
 
 
@@ -40,6 +40,11 @@ def add(parser: argparse.ArgumentParser) -> None:
         metavar="DIR",
         help=f"folder of benches with their episodes, from another run or new (default: {BENCHES_FOLDER} in --out)",
     )
+    parser.add_argument(
+        "--towel",
+        action="store_true",
+        help=f"a newcomer's towel on a bar instead, {TOWEL_COUNT} motions of it: nothing is off but a grip that turns",
+    )
     parser.add_argument("--episodes-only", action="store_true", help="make benches and episodes, and fit none")
     parser.add_argument(
         "--compare",
@@ -51,16 +56,18 @@ def add(parser: argparse.ArgumentParser) -> None:
 def run(options: argparse.Namespace) -> None:
     """Make every episode that is missing, fit each one; print and write the tables."""
     check_jobs(options.jobs)
-    count = (FAST_BENCH_COUNT if options.fast else BENCH_COUNT) if options.benches is None else options.benches
+    usual_count = FAST_BENCH_COUNT if options.fast else TOWEL_COUNT if options.towel else BENCH_COUNT
+    count = usual_count if options.benches is None else options.benches
     if count < 1 or options.first < 0:
         raise InvalidInput("--benches, --first", got=f"{count}, {options.first}", expected="1 or more; 0 or more")
     interpreters = {THIS_VERSION: sys.executable}
     if options.compare is not None:
         name, python = parse_comparison(options.compare)
         interpreters[name] = python
-    study = ResumableStudy(options.out, {"study": "strangers", "fast": options.fast})
+    settings = {"study": "strangers", "fast": options.fast, **({"towel": True} if options.towel else {})}
+    study = ResumableStudy(options.out, settings)
     study.start()
-    benches = _Benches(options.episodes or options.out / BENCHES_FOLDER, options.fast)
+    benches = _Benches(options.episodes or options.out / BENCHES_FOLDER, options.fast, options.towel)
     seeds = range(options.first, options.first + count)
     if options.episodes_only:
         study.run({case_name(seed, "episode"): partial(benches.find_or_make, seed) for seed in seeds}, options.jobs)
@@ -83,16 +90,16 @@ def run(options: argparse.Namespace) -> None:
 class _Benches:
     """The benches of a folder; each is made once, also where several fits ask for it at a time."""
 
-    def __init__(self, folder: Path, fast: bool) -> None:
-        self.folder, self.fast = folder, fast
+    def __init__(self, folder: Path, fast: bool, is_towel: bool) -> None:
+        self.folder, self.fast, self.is_towel = folder, fast, is_towel
         self._locks: defaultdict[int, threading.Lock] = defaultdict(threading.Lock)
 
     def bench_folder(self, seed: int) -> Path:
-        return self.folder / f"{seed:03d}"
+        return self.folder / (f"towel-{seed}" if self.is_towel else f"{seed:03d}")
 
     def find_or_make(self, seed: int) -> dict[str, Any]:
         with self._locks[seed]:
-            return find_or_make_episode(self.bench_folder(seed), seed, self.fast)
+            return find_or_make_episode(self.bench_folder(seed), seed, self.fast, self.is_towel)
 
 
 def run_case(benches: _Benches, out: Path, seed: int, version: str, python: str) -> dict[str, Any]:

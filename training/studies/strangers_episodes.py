@@ -27,7 +27,7 @@ from torchcloth.errors import InvalidInput
 
 from ..validation.independent.bench_files import write_bench
 from ..validation.independent.flex_sheet import SheetSpec, interpolate_bilinear
-from ..validation.independent.stranger_bench import BenchSize, StrangerBench, make_bench
+from ..validation.independent.stranger_bench import BenchSize, StrangerBench, draw_bench, draw_towel, make_bench
 from .honesty import run_command
 
 Array = np.ndarray
@@ -38,7 +38,7 @@ CHECKED_CLOUDS = 10
 FILE_OPTIONS = ("--joints", "--base", "--depth", "--intrinsics", "--camera-pose")
 
 
-def find_or_make_episode(folder: Path, seed: int, fast: bool) -> dict[str, Any]:
+def find_or_make_episode(folder: Path, seed: int, fast: bool, is_towel: bool = False) -> dict[str, Any]:
     """Return what is hidden in a seed's bench; make its files and its episode where they are missing.
 
     Raises:
@@ -55,7 +55,7 @@ def find_or_make_episode(folder: Path, seed: int, fast: bool) -> dict[str, Any]:
             raise InvalidInput("--episodes", got=got, expected=f"{asdict(size)}", remedy=remedy)
         return truth
     shutil.rmtree(folder, ignore_errors=True)
-    bench = make_bench(seed, size)
+    bench = make_bench(seed, size, draw_towel if is_towel else draw_bench)
     write_bench(bench, folder / "files")
     _write_arrays(bench, folder / "truth.npz")
     return remake_episode(folder, _describe(bench))

@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from itertools import pairwise
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -60,6 +61,7 @@ ARM_MODEL, ARM_TOOL = "rizon4", "tcp_closed"
 ONE_ARM_NAME = "gripper"
 ARM_SIDES = {"left": 1.0, "right": -1.0}  # sign of y
 STATED_GRIP_RADIUS_M = 0.012  # what ``torchcloth new`` assumes
+TOWEL_WIDTH_M, TOWEL_HEIGHT_M = 0.4, 0.3
 SIDE_RANGE_M, ASPECT_RANGE = (0.28, 0.34), (0.8, 1.0)
 # A square that hangs from a corner looks the same with its sides exchanged: no cloud shows which is which.
 CORNER_SIDE_RANGE_M, CORNER_ASPECT_RANGE = (0.30, 0.36), (0.65, 0.78)
@@ -259,21 +261,68 @@ def motion_of_seed(seed: int) -> str:
     return list(MOTIONS)[seed % len(MOTIONS)]
 
 
-def make_bench(seed: int, size: BenchSize | None = None) -> StrangerBench:
+class BenchDraw(NamedTuple):
+    """What is drawn before a bench is simulated.
+
+    Attributes:
+        holding: one of ``HOLDINGS``.
+        camera: one of ``CAMERAS``.
+        faults: what is off.
+        fault_sizes: each with its size and unit.
+        scene: the sheet, its bending and the air.
+    """
+
+    holding: str
+    camera: str
+    faults: Faults
+    fault_sizes: dict[str, str]
+    scene: Scene
+
+
+def draw_bench(seed: int, rng: np.random.Generator, spacing: float) -> BenchDraw:
+    """Draw the bench of a seed; ``rng`` draws the sheet, whose vertices are ``spacing`` [m] apart."""
+    holding = holding_of_seed(seed)
+    faults, sizes = draw_faults(seed, np.random.default_rng([seed, 77, 2]))
+    return BenchDraw(
+        holding, camera_of_seed(seed), faults, sizes, _draw_scene(rng, holding, faults.held_depth, spacing)
+    )
+
+
+def draw_towel(seed: int, rng: np.random.Generator, spacing: float) -> BenchDraw:
+    """Return a newcomer's towel: on a bar as on a hinge, before a stereo camera, and nothing else is off."""
+    del seed, rng  # they draw the motion, the noise and the first shape
+    sheet = SheetSpec(
+        TOWEL_WIDTH_M,
+        TOWEL_HEIGHT_M,
+        nodes=(round(TOWEL_WIDTH_M / spacing) + 1, round(TOWEL_HEIGHT_M / spacing) + 1),
+        areal_density=0.3,
+        membrane_stiffness=800.0,
+        poisson_ratio=0.3,
+        damping_time=2e-4,
+    )
+    scene = Scene(sheet, PlateSpec(stiffness=1e-4, damping_time=0.015), air=AirSpec(normal=1.3))
+    return BenchDraw("bar", "realsense", Faults(), {"grip": "hinge"}, scene)
+
+
+def make_bench(
+    seed: int,
+    size: BenchSize | None = None,
+    draw: Callable[[int, np.random.Generator, float], BenchDraw] = draw_bench,
+) -> StrangerBench:
     """Simulate a bench.
 
     Args:
         seed: of everything.
         size: of meshes and images; None: the usual one.
+        draw: draws what is simulated.
 
     Raises:
         InvalidInput: no motion of the seed is within the arms' reach.
     """
     size = size or BenchSize()
-    scene_rng, motion_rng, fault_rng, time_rng = (np.random.default_rng([seed, 77, k]) for k in range(4))
-    holding, motion = holding_of_seed(seed), motion_of_seed(seed)
-    faults, fault_sizes = draw_faults(seed, fault_rng)
-    scene = _draw_scene(scene_rng, holding, faults.held_depth, size.spacing)
+    scene_rng, motion_rng, _, time_rng = (np.random.default_rng([seed, 77, k]) for k in range(4))
+    motion = motion_of_seed(seed)
+    holding, camera, faults, fault_sizes, scene = draw(seed, scene_rng, size.spacing)
     rig = _make_rig(holding)
     t, poses, joints = _draw_reachable_path(motion_rng, rig, holding, motion, scene.sheet)
     origin = np.zeros(3)
@@ -286,7 +335,7 @@ def make_bench(seed: int, size: BenchSize | None = None) -> StrangerBench:
     return StrangerBench(
         seed,
         holding,
-        camera_of_seed(seed),
+        camera,
         motion,
         fault_sizes,
         true_parameters(scene),
