@@ -1,5 +1,6 @@
 """A fit on a coarse mesh, corrected by one simulation on a finer one."""
 
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -11,10 +12,13 @@ import torchcloth as tc
 from torchcloth.boundaries import Grasp
 from torchcloth.episodes.unknowns import collect_unknowns
 from torchcloth.errors import InvalidInput, SimulationDiverged
-from torchcloth.identification import fit, identify
+from torchcloth.identification import build_episode, identify
+from torchcloth.identification.estimators import levenberg_marquardt
 from torchcloth.identification.estimators.objective import Objective
+from torchcloth.identification.fit import default_parameters
+from torchcloth.identification.uncertainty import richardson
 from torchcloth.identification.uncertainty.model_error import MODEL_ERRORS
-from torchcloth.identification.uncertainty.richardson import refine_cloth, refine_recording
+from torchcloth.identification.uncertainty.richardson import MeshCorrection, refine_cloth, refine_recording
 
 PAIR = ["youngs_modulus", "air.normal"]
 
@@ -78,7 +82,7 @@ def test_a_residual_force_is_no_parameter_and_no_obstacle(model):
     """As in the extended model of a diagnosis: its strengths are not fitted, and it stays on the finer mesh."""
     law = tc.effects.ResidualForce({"across": 0.1, "mass@edge": 0.01}, gripped_vertices=[0, 1])
     cloth = tc.Cloth(model.mesh, tc.materials.AEP(1e5), 0.2, {"residual": law}, contact=None)
-    assert "residual.strength" not in fit.default_parameters(cloth)
+    assert "residual.strength" not in default_parameters(cloth)
     fine = refine_cloth(cloth)
     assert fine.effects["residual"].gripped_vertices == (0, 1)
     assert len(fine.effects["residual"].vertex_area) == len(fine.mesh.vertices)
@@ -101,7 +105,7 @@ def test_a_finer_mesh_that_cannot_be_simulated_leaves_the_fit_and_says_so(model,
     def torn(*_):
         raise SimulationDiverged("the cloth is torn apart")
 
-    monkeypatch.setattr(fit, "mesh_correction", torn)
+    monkeypatch.setattr(richardson, "mesh_correction", torn)
     result = identify(model, brief, ["youngs_modulus"], refine=True, exact_bench=True)
     assert result.parameters == identify(model, brief, ["youngs_modulus"], exact_bench=True).parameters
     assert "mesh_correction" not in result.fit
@@ -206,10 +210,39 @@ def test_a_correction_that_cannot_be_simulated_is_none(model, brief, monkeypatch
         moved = torch.zeros_like(final.raw)
         moved[0] = 0.1 * longest
         monkeypatch.setattr(Objective, "observe", torn_elsewhere)
-        return moved
+        return MeshCorrection(moved, math.nan)
 
     ended = []
-    monkeypatch.setattr(fit, "mesh_correction", step)
+    monkeypatch.setattr(richardson, "mesh_correction", step)
     result = identify(model, brief, ["youngs_modulus"], refine=True, exact_bench=True)
     assert result.parameters == plain.parameters
     assert any("not corrected for the coarseness of the mesh: on a finer one, the cloth" in w for w in result.warnings)
+
+
+@pytest.mark.parametrize(("gain_ratio", "is_applied"), [(0.6, True), (-0.3, False)])
+def test_a_correction_that_a_finer_mesh_does_not_confirm_withdraws_what_it_moves(
+    model, brief, monkeypatch, gain_ratio, is_applied
+):
+    def correct(objective, final, *_):
+        step = torch.zeros_like(final.raw)
+        step[0] = 5 * levenberg_marquardt.covariance(objective.problem(), final).diagonal().sqrt()[0]
+        return MeshCorrection(step, gain_ratio)
+
+    monkeypatch.setattr(richardson, "mesh_correction", correct)
+    result = identify(model, brief, PAIR, refine=True, exact_bench=True)
+    plain = identify(model, brief, PAIR, exact_bench=True)
+    assert plain.parameters["youngs_modulus"].identifiable
+    assert result.parameters["youngs_modulus"].identifiable is is_applied
+    assert result.parameters["air.normal"].identifiable is plain.parameters["air.normal"].identifiable
+    assert ("mesh_correction" in result.fit) is is_applied
+    assert any("no estimate of youngs_modulus" in w for w in result.warnings) is not is_applied
+
+
+def test_the_finer_mesh_confirms_what_it_asks_for(recording, model):
+    """Along its own step its cost falls about as far as the slopes of the given mesh promise."""
+    unknowns = collect_unknowns(model, PAIR, None)
+    objective = Objective(model, unknowns, [build_episode(model, recording)])
+    final = levenberg_marquardt.minimise(objective.problem(), objective.start, 20, lambda at: False)
+    scene = richardson.FineScene(refine_cloth(model), [recording])
+    correction = richardson.mesh_correction(objective, final, scene)
+    assert correction.gain_ratio == pytest.approx(1.0, abs=0.5)

@@ -9,7 +9,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal, cast
 
-import torch
 from torch import Tensor
 
 from .._utils.resume import ResumableStore
@@ -19,7 +18,7 @@ from ..effects import AbstractEffect
 from ..episodes.observed import Episode, build_episode, check_recordings, require_cpu
 from ..episodes.replay import Frames
 from ..episodes.unknowns import apply_priors, collect_unknowns
-from ..errors import InvalidInput, SimulationDiverged, UnstableStep
+from ..errors import InvalidInput
 from ..inspection.corrections import check_all
 from ..parameters import PhysicalParameter
 from ..recordings import Recording
@@ -43,13 +42,7 @@ from .uncertainty.misfit import estimate_point_noise, find_misfit
 from .uncertainty.model_error import MODEL_ERRORS, ModelErrors, add_model_error
 from .uncertainty.profile_likelihood import compute_profiles
 from .uncertainty.replicates import assign_strata
-from .uncertainty.richardson import (
-    CORRECTION_UNCERTAINTY,
-    EXTRAPOLATION_FACTOR,
-    FineScene,
-    mesh_correction,
-    refine_cloth,
-)
+from .uncertainty.richardson import FineScene, correct_for_mesh, refine_cloth
 
 DEFAULT_MAX_ITERATIONS = 35  # of the DiffCP paper
 MAX_STARTS = 1000
@@ -288,10 +281,9 @@ def _assemble_result(
     # covariance, and the correction for the mesh
     covariance = solution_covariance(used, checked, search.strata)
     is_regular = not checked.is_withdrawn and checked.covariance is None
-    final, covariance, mesh_entries, uncorrected = _correct_for_mesh(
-        full, used, final, covariance, fine_scene if is_regular else None
-    )
-    warnings += uncorrected
+    corrected = correct_for_mesh(full, final, covariance, fine_scene if is_regular and used is full else None)
+    final, covariance = corrected.final, corrected.covariance
+    warnings += corrected.warnings
     end = full.observe(final.raw)
     after = [s.x for s in end]
 
@@ -318,7 +310,7 @@ def _assemble_result(
         "converged": final.converged,
         "stamp_std": 0.0 if full.frame_times is None else full.frame_times.std,
         **_observation_entries(used, final),
-        **mesh_entries,
+        **corrected.entries,
     }
     if search.strata is not None and bool((search.strata > 0).any()):
         fit["replicates"] = int((search.strata > 0).sum())
@@ -327,7 +319,7 @@ def _assemble_result(
 
     # withdrawal and warnings
     unbeaten_null = find_unbeaten_null(full, end)
-    if mesh_entries:  # it moved the solution
+    if corrected.entries:  # it moved the solution
         misfit_reason, likely_reasons = _find_misfit(full, used, final, chamfer_before, noise_std)
     limits = find_limit_reasons(full.unknowns, final.raw)
     warnings += [
@@ -338,7 +330,7 @@ def _assemble_result(
     fit["withdrawn"] = is_withdrawn
     if is_withdrawn:  # slopes of chaos, or far from the optimum, promise tiny errors
         estimates = withdraw_estimates(estimates, full.unknowns, final.raw)
-    elif unusable := _unusable_parameters(full, checked, profiles) | set(limits):
+    elif unusable := _unusable_parameters(full, checked, profiles) | set(limits) | set(corrected.unusable):
         estimates = withdraw_estimates(estimates, full.unknowns, final.raw, unusable)
     warnings += [reason for reason in (misfit_reason, outcome.unfinished_reason) if reason]
     warnings += warn_of_skew(estimates, [name for name in checked.curved_parameters if name not in profiles])
@@ -404,31 +396,6 @@ def _find_misfit(
         return "", {}
     reasons = rank_reasons(used, final)
     return f"{reason}; {describe_reasons(reasons)}", {r.name: r.share for r in reasons}
-
-
-def _correct_for_mesh(
-    full: Objective,
-    used: Objective,
-    final: levenberg_marquardt.Iterate,
-    covariance: Tensor,
-    scene: FineScene | None,
-) -> tuple[levenberg_marquardt.Iterate, Tensor, dict[str, float], list[str]]:
-    """Extrapolate the solution to ever smaller triangles.
-
-    Returns:
-        The solution, its wider covariance, the size of the correction for ``fit``, and why it is not known.
-    """
-    if scene is None or used is not full:
-        return final, covariance, {}, []
-    try:
-        step = mesh_correction(full, final, scene)
-        moved = final._replace(raw=full.clip(final.raw + EXTRAPOLATION_FACTOR * step))
-        full.observe(moved.raw)  # fails here if it cannot be simulated; the frames are remembered for later
-    except (SimulationDiverged, UnstableStep) as error:
-        return final, covariance, {}, [f"not corrected for the coarseness of the mesh: on a finer one, {error}"]
-    correction = EXTRAPOLATION_FACTOR * step.abs() / covariance.diagonal().sqrt()
-    entries = {"mesh_correction": float(correction[: len(full.unknowns)].max())}
-    return moved, covariance + CORRECTION_UNCERTAINTY**2 * torch.outer(step, step), entries, []
 
 
 def _observed_frames(frames: Sequence[Tensor], full: Objective) -> list[Tensor]:
