@@ -5,6 +5,7 @@ from dataclasses import replace
 import pytest
 import torch
 
+import torchcloth as tc
 from torchcloth.diagnosis.causes.hypotheses import list_hypotheses
 from torchcloth.episodes.steps import central_steps
 from torchcloth.episodes.world_batches import WorldRun, group_runs, simulate_group
@@ -54,3 +55,18 @@ def test_a_run_that_fails_takes_no_other_along(runs):
     torch.testing.assert_close(frames[0].x, good.simulate().x, rtol=0, atol=0)
     with pytest.raises(UnstableStep):
         simulate_group([good, bad._replace(may_fail=False)])
+
+
+def test_a_users_part_is_in_no_batch(runs):
+    """It may keep its amplitude where no fingerprint looks."""
+
+    class Push(tc.effects.AbstractEffect):
+        def __init__(self, size):
+            super().__init__()
+            self._size = size
+
+        def coefficients(self):
+            return None
+
+    worlds = [runs[0].world.with_cloth({"push": Push(size)}) for size in (1.0, -1.0)]
+    assert len(group_runs([WorldRun(world, runs[0].episode) for world in worlds])) == 2

@@ -8,9 +8,14 @@ from pathlib import Path
 from ..cloth import Cloth
 
 
+def is_library_part(kind: type) -> bool:
+    """Tell whether a part is the library's or torch's, and no user's."""
+    return kind.__module__.split(".")[0] in ("torchcloth", "torch")
+
+
 def _read_source(kind: type) -> str:
     """Source of a user's part. Empty for parts of the library, whose version is hashed elsewhere, or if unreadable."""
-    if kind.__module__.split(".")[0] in ("torchcloth", "torch"):
+    if is_library_part(kind):
         return ""
     try:
         return Path(inspect.getfile(kind)).read_text(encoding="utf-8")

@@ -15,7 +15,7 @@ from .._utils.resume import digest
 from ..cloth import Cloth
 from ..parameters import call_with_parameters
 from ..types import Trajectory
-from .cloth_fingerprint import cloth_fingerprint_parts
+from .cloth_fingerprint import cloth_fingerprint_parts, is_library_part
 from .observed import Episode
 from .replay import SIMULATIONS_PER_BATCH, Frames, Replay, frames_from_rollout, map_frames
 from .world import World
@@ -73,10 +73,14 @@ def simulate_group(runs: Sequence[WorldRun]) -> list[Frames | None]:
 
 
 def _batch_key(run: WorldRun) -> str:
-    """Return what runs of a batch have in common: everything but scalar parameters, first states and poses."""
+    """Return what runs of a batch have in common: everything but scalar parameters, first states and poses.
+
+    A user's part may keep numbers anywhere, so nothing but itself has its key.
+    """
     cloth, episode = run.world.cloth, run.world.apply_motion(run.episode)
     scalars = set(map(id, _scalar_parameters(cloth).values()))
     parts = ["scalar" if id(part) in scalars else part for part in cloth_fingerprint_parts(cloth)]
+    parts += [id(part) for part in cloth.modules() if not is_library_part(type(part))]
     motion = [part for name, m in episode.motion.items() for part in (name, m.t, m.closed, m.pose.shape)]
     state = [episode.needs_settling, episode.initial_velocity is None]
     return digest([*parts, *motion, *state, episode.times, run.dt])
