@@ -75,14 +75,18 @@ def test_the_likeliest_reason_is_named_first(faulty):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("spoil", [shift_camera, jitter_stamps])
-def test_an_error_of_the_bench_is_an_unknown_by_default(recording, spoil):
-    """The same recordings, without ``exact_bench``: they are described, and the stiffness is within its error."""
+@pytest.mark.parametrize(("spoil", "is_identifiable"), [(shift_camera, True), (jitter_stamps, False)])
+def test_an_error_of_the_bench_is_an_unknown_by_default(recording, spoil, is_identifiable):
+    """The same recordings, without ``exact_bench``: they are described, and the stiffness is within its error.
+
+    The search of the one whose stamps scatter ends a little more than a standard error from the optimum.
+    """
     stranger = replace(spoil(recording), observation_noise_std=None)
     fit = identify(twins.build_cloth_at(recording, youngs_modulus=4e4), stranger, PARAMETERS, checks=False)
     stiffness = fit.parameters["membrane_stiffness"]
     assert not any("does not describe these data" in w for w in fit.warnings)
-    assert stiffness.identifiable
+    assert stiffness.identifiable is is_identifiable
+    assert stiffness.value == pytest.approx(twins.TRUE_FABRIC.membrane, rel=0.1)
     assert abs(stiffness.value - twins.TRUE_FABRIC.membrane) < 2 * stiffness.std
 
 

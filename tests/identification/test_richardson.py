@@ -145,14 +145,14 @@ def _unconstrained(unknown, estimate):
 
 @pytest.mark.slow
 def test_a_mesh_that_is_fine_already_is_hardly_corrected(recording):
-    """With the truth's own spacing halved the step is below a standard error."""
+    """With the truth's own spacing halved the step is below a standard error. What noise does to it stays."""
     fine = refine_cloth(twins.build_cloth_at(recording))
     episode = refine_recording(recording, twins.build_cloth_at(recording).mesh, fine.mesh)
     coarse, finer = (
         identify(c, r, PAIR, refine=True, exact_bench=True).fit["mesh_correction"]
         for c, r in ((twins.build_cloth_at(recording), recording), (fine, episode))
     )
-    assert finer < 0.6 * coarse
+    assert finer < 0.7 * coarse
     assert finer < 1.0
 
 
