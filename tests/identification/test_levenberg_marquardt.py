@@ -202,6 +202,31 @@ def test_broyden_and_exact_jacobians_end_at_the_same_point():
     assert b.exact
 
 
+def test_steps_are_doubled_where_slopes_overestimate_the_curvature():
+    """Every other row has slopes that finite steps do not have, as ripples do: full steps are three times too short."""
+
+    def linearised_points(max_doublings):
+        toy, jacobian = make_linear_problem(0)
+        follows = (torch.arange(len(jacobian)) % 2 == 0).double()
+        toy.model = lambda raw: follows * (jacobian @ raw)
+        toy.data = follows * toy.data
+        problem, points = toy.problem(), []
+
+        def linearise(raw):
+            points.append(raw)
+            ripples = (1 - follows)[:, None] * 1.4 * jacobian
+            linear = problem.linearise(raw)
+            return linear._replace(jacobian=linear.jacobian + ripples)
+
+        settings = levenberg_marquardt.SolverSettings(max_doublings=max_doublings)
+        rippled = problem._replace(linearise=linearise)
+        final = minimise(rippled, START_UNKNOWNS, 40, lambda at: False, tolerance=0.01, settings=settings)
+        assert (final.raw - TRUE_UNKNOWNS).norm() < 0.1 * (START_UNKNOWNS - TRUE_UNKNOWNS).norm()
+        return len(points)
+
+    assert linearised_points(3) < 0.8 * linearised_points(0)
+
+
 def quadratics(count=60):
     """(square root of the matrix [20, 6], right side of the rows [20], bounds [6]): strongly coupled unknowns."""
     generator = torch.Generator().manual_seed(0)
