@@ -72,6 +72,8 @@ def test_a_sheet_on_a_bar_becomes_an_episode(bar, tmp_path, capsys):
     said, recording = capsys.readouterr().out, recordings.read(tmp_path / "episode")
     for guess in ("milliseconds", "degrees", "depth_times.csv", "on one clock", "closed all", "by their order"):
         assert guess in said
+    assert "holds the whole edge at" in said
+    assert "from the mass on a scale of 1 g" in said
     assert "verdict: Ready for identify." in said
     assert said.splitlines()[-1] == f"next: torchcloth identify {tmp_path}/episode --out {tmp_path}/episode_fit"
     assert (tmp_path / "episode" / "new.png").stat().st_size > 20_000
@@ -123,6 +125,8 @@ def replace_option(options: list[str], option: str, *values: str) -> list[str]:
         ("--held", ("0.1", "0.1"), "on no edge"),
         ("--held", ("0.1", "25"), "v from 0 to 0.25 m"),
         ("--sheet", ("0.3", "-1"), "width and height > 0"),
+        ("--sheet", ("30", "25"), "convert mm or cm to m"),
+        ("--mass", ("20",), "convert g to kg"),
         ("--tool", ("hand",), "has no link for frame"),
         ("--mass", ("0",), "--mass"),
         ("--depth", ("nowhere",), "is no folder"),

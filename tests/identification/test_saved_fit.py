@@ -12,6 +12,7 @@ from torchcloth import recordings
 from torchcloth.dynamics.contact import Contact
 from torchcloth.effects import AirDrag, Gravity
 from torchcloth.errors import InvalidInput, RecordingError, UnstableStep
+from torchcloth.export import export_fit
 from torchcloth.identification import build_cloth, identify, load_fitted_cloth, predict_episode, replay_fit
 from torchcloth.identification.io.saved_fit import read_saved_fit
 from torchcloth.identification.io.unrecorded_settings import find_unrecorded_settings
@@ -44,6 +45,17 @@ def test_what_the_data_left_open_is_uncertain_and_not_exact(pair, recording, tmp
     _, unknown = load_fitted_cloth(path, recording)
     assert unknown["youngs_modulus"] == pytest.approx((known["youngs_modulus"][0], 10.0), rel=0.01)
     assert unknown["air.normal"] == known["air.normal"]
+
+
+def test_an_export_says_what_is_no_estimate(pair, recording, tmp_path):
+    path = pair.save(tmp_path)
+    assert not any("no estimate" in note for note in export_fit(path, "mujoco", recording=recording).notes)
+    content = json.loads(path.read_text())
+    content["parameters"]["youngs_modulus"]["identifiable"] = False
+    path.write_text(json.dumps(content))
+    export = export_fit(path, "mujoco", recording=recording)
+    assert export.notes[0].startswith("no estimate of youngs_modulus:")
+    assert "no estimate of youngs_modulus:" in export.text
 
 
 def test_points_may_have_been_rounded_on_disk(pair, recording, tmp_path):

@@ -12,8 +12,10 @@ import numpy as np
 from ..episodes.recorded_cloth import DEFAULT_MEMBRANE_STIFFNESS_N_PER_M, DEFAULT_POISSON_RATIO, build_cloth
 from ..errors import InvalidInput
 from ..inspection.camera_from_arm import describe_pose_errors, find_camera_pose_from_arms
+from ..meshes.mesh import MAX_AREAL_DENSITY_KG_PER_M2
 from ..pose import PoseEstimator, estimate_first_shape
 from ..recordings import ClothInfo, JointMotion, Recording, RobotInfo, write
+from ..recordings.checks import MAX_SCENE_EXTENT_M
 from ..recordings.formats.imported import to_seconds
 from ..recordings.formats.joint_log import AngleUnit
 from ..recordings.formats.tables import TimeUnit
@@ -101,9 +103,13 @@ def new_episode(
     """
     if not (np.shape(sheet) == (2,) and np.isfinite(sheet).all() and min(sheet) > 0):
         raise InvalidInput("sheet", got=sheet, expected="width and height > 0 in m")
+    if max(sheet) > MAX_SCENE_EXTENT_M:
+        expected = f"width and height in m, at most {MAX_SCENE_EXTENT_M:g}"
+        raise InvalidInput("sheet", got=sheet, expected=expected, remedy="convert mm or cm to m")
     radius = DEFAULT_GRIP_RADIUS_M if grip_radius is None else grip_radius
     bench, notes = read_arms(arms, angle_unit, time_unit)
     grips = {n: make_grip(sheet, one.files.grip, one.files.is_bar, radius) for n, one in bench.items()}
+    notes += [f"{name}: holds {_describe_hold(one.files)}" for name, one in bench.items()]
     seen, camera_notes = read_camera(camera, time_unit)
     cloth, cloth_notes = _describe_cloth(sheet, mass, radius if grip_radius is None else None)
     recording, is_one_clock = _assemble(bench, seen, cloth, grips)
@@ -130,6 +136,13 @@ def new_episode(
     return NewEpisode(recording, notes, picture.getvalue())
 
 
+def _describe_hold(files: ArmFiles) -> str:
+    u, v = files.grip
+    if files.is_bar:
+        return f"the whole edge at ({u:g}, {v:g}) m of the sheet, on a bar"
+    return f"the sheet at ({u:g}, {v:g}) m alone (a bar along an edge: --bar)"
+
+
 def _describe_cloth(
     sheet: tuple[float, float], mass: float | None, guessed_radius: float | None
 ) -> tuple[ClothInfo, list[str]]:
@@ -139,7 +152,13 @@ def _describe_cloth(
         if not (np.isfinite(mass) and mass > 0):
             raise InvalidInput("mass", got=mass, expected="a number > 0 in kg")
         density = mass / (sheet[0] * sheet[1])
+        if density > MAX_AREAL_DENSITY_KG_PER_M2:
+            got = f"{mass:g} kg, which is {density:.3g} kg/m^2"
+            raise InvalidInput(
+                "mass", got=got, expected=f"at most {MAX_AREAL_DENSITY_KG_PER_M2:g} kg/m^2", remedy="convert g to kg"
+            )
         std = density * float(np.hypot(WEIGHED_STD_FRACTION, SCALE_STD_KG / mass))
+        notes.append(f"areal density: {density:.3g} ± {std:.2g} kg/m^2, from the mass on a scale of 1 g")
     else:
         notes.append(
             f"areal density: {density:g} ± {std:g} kg/m^2, a guess; weigh the sheet and give --mass, as every "

@@ -73,6 +73,6 @@ def _print(export: Export) -> None:
     for parameter in export.parameters:
         table.add_row(parameter.name, f"{parameter.value:.5g}", parameter.unit, parameter.meaning)
     Console().print(table)
-    print(f"What {export.target} does not express, or only in part:")
+    print(f"What is not known, and what {export.target} does not express, or only in part:")
     for sentence in export.notes:
         print(textwrap.fill(sentence, LINE_WIDTH, initial_indent="- ", subsequent_indent="  "))

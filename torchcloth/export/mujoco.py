@@ -152,7 +152,7 @@ def _write_xml(
     elastic = "both" if sheet.bending > 0 else "stretch"
     comments = "\n".join(f"  {note}".replace("--", "- -") for note in notes)
     return f"""<mujoco model="cloth">
-  <!-- Cloth identified by torchcloth, in SI units, for MuJoCo 4.0 or newer. What MuJoCo does not express:
+  <!-- Cloth identified by torchcloth, in SI units, for MuJoCo 4.0 or newer. What is not known, or not expressed:
 {comments}
   -->
   <option timestep="{step:.6g}" integrator="Euler" gravity="{_join(sheet.gravity)}"{drag}/>

@@ -33,7 +33,7 @@ class Export:
         target: "mujoco", "newton" or "usd".
         text: content of the file.
         parameters: the numbers in it that describe the fabric.
-        notes: what the target does not express, a sentence each.
+        notes: what the fit does not know and the target does not express, a sentence each.
     """
 
     target: str

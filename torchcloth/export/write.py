@@ -66,7 +66,7 @@ def export_fit(
         InvalidInput: no such file or target, or a fit of episodes without one.
         RecordingError: the file cannot be read, or the episode is of another cloth.
     """
-    fit, initial = Path(fit), None
+    fit, initial, unidentified = Path(fit), None, ()
     _check_target(target, path)
     if fit.suffix == MODEL_SUFFIX:
         cloth = diagnosis.load(fit) if recording is None else diagnosis.load_cloth_for(fit, recording)
@@ -77,9 +77,14 @@ def export_fit(
         )
     else:
         cloth, _ = load_fitted_cloth(fit, recording, diagnosis.make_start_builder(fit))
+        unidentified = read_saved_fit(fit).unidentified
     if recording is not None:
         initial = compute_initial_vertices(str(recording.path), cloth, recording).numpy()
     sheet = describe_sheet(cloth, initial)
+    if unidentified:
+        names = ", ".join(unidentified)
+        note = f"no estimate of {names}: the data of the fit do not tell, and numbers that depend on these are guesses"
+        sheet = replace(sheet, notes=(note, *sheet.notes))
     if fit.suffix == MODEL_SUFFIX:
         outside = diagnosis.list_causes_outside_cloth(diagnosis.load_model(fit))
         added = [f"cause {name} ({value:.3g}) is of the robot or the observer" for name, value in outside.items()]

@@ -173,6 +173,7 @@ class SavedFit:
         stds: standard errors of the fitted parameters, by name.
         unrecorded_settings: names of settings of the fitted cloth that its first episode does not describe.
         has_start_model: whether the fit began with a .tcm file, a copy of which lies in the same folder.
+        unidentified: names of the fitted parameters whose values are no estimates.
         correlation: [K, K] of the fitted parameters, in the order of ``stds``.
         thickness: m, with which moduli [Pa] were fitted; None: the material has none.
         misfit_rms: m, rms distance that the fit left in its own episodes; NaN where there were no points.
@@ -186,6 +187,7 @@ class SavedFit:
     stds: dict[str, float]
     unrecorded_settings: list[str]
     has_start_model: bool
+    unidentified: tuple[str, ...]
     correlation: np.ndarray
     thickness: float | None
     misfit_rms: float
@@ -240,6 +242,7 @@ def _parse_fit(content: dict[str, Any]) -> SavedFit:
         stds={name: check_number(parameters[name]["std"], 0.0, f"{name}'s std") for name in correlation},
         unrecorded_settings=[str(name) for name in model["unrecorded_settings"]],
         has_start_model="start_model" in model,
+        unidentified=tuple(name for name in correlation if parameters[name]["identifiable"] is not True),
         correlation=matrix,
         thickness=None if thickness is None else check_number(thickness, 0.0, "thickness"),
         misfit_rms=math.nan if misfit is None else check_number(misfit, 0.0),
