@@ -1,5 +1,6 @@
 """Worlds that differ in numbers only share a batch, and move as they do alone."""
 
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
 import pytest
@@ -70,3 +71,16 @@ def test_a_users_part_is_in_no_batch(runs):
 
     worlds = [runs[0].world.with_cloth({"push": Push(size)}) for size in (1.0, -1.0)]
     assert len(group_runs([WorldRun(world, runs[0].episode) for world in worlds])) == 2
+
+
+def test_threads_may_simulate_a_world_while_it_is_in_a_batch(runs):
+    """Its own parameters never change."""
+    (group,) = (group for group in group_runs(runs) if 0 in group)
+    alone = runs[0].simulate()
+    with ThreadPoolExecutor(4) as pool:
+        batches = [pool.submit(simulate_group, [runs[k] for k in group]) for _ in range(3)]
+        singles = [pool.submit(runs[0].simulate) for _ in range(30)]
+    for single in singles:
+        torch.testing.assert_close(single.result().x, alone.x, rtol=0, atol=0)
+    for batch in batches:
+        torch.testing.assert_close(batch.result()[0].x, alone.x, rtol=0, atol=MAX_DIFFERENCE_M)

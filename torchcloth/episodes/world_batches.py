@@ -18,7 +18,7 @@ from ..types import Trajectory
 from .cloth_fingerprint import cloth_fingerprint_parts, is_library_part
 from .observed import Episode
 from .replay import SIMULATIONS_PER_BATCH, Frames, Replay, frames_from_rollout, map_frames
-from .world import World
+from .world import World, copy_cloth
 from .world_cache import IMPOSSIBLE_WORLD_ERRORS, none_if_impossible
 
 
@@ -106,7 +106,8 @@ def _simulate_batch(runs: Sequence[WorldRun]) -> list[Frames]:
         initial=torch.stack([e.initial for e in episodes]),
         initial_velocity=torch.stack(velocities) if velocities else None,
     )
-    frames = frames_from_rollout(call_with_parameters(Replay(cloths[0]), entries, (episode, runs[0].dt)))
+    cloth = copy_cloth(cloths[0])  # other threads may simulate the world's own, whose parameters must not change
+    frames = frames_from_rollout(call_with_parameters(Replay(cloth), entries, (episode, runs[0].dt)))
     return [map_frames(frames, itemgetter(k)) for k in range(len(runs))]
 
 

@@ -288,8 +288,7 @@ def _assemble_result(
     after = [s.x for s in end]
 
     # estimates, with profiles where the whole motion is regular
-    has_unknown_grips = any(isinstance(nuisance, GripExtent) for nuisance in full.nuisances)
-    total_covariance = add_model_error(full.unknowns, final.raw, covariance, model_errors, has_unknown_grips)
+    total_covariance = add_model_error(full.unknowns, final.raw, covariance, model_errors, _has_unknown_grips(full))
     estimates = make_estimates(full.cloth, full.unknowns, final.raw, total_covariance)
     has_profiles = not (checked.warnings or checked.is_withdrawn)
     profiles = compute_profiles(used, final, covariance, profile, search.report_progress) if has_profiles else {}
@@ -331,7 +330,7 @@ def _assemble_result(
     fit["withdrawn"] = is_withdrawn
     if is_withdrawn:  # slopes of chaos, or far from the optimum, promise tiny errors
         estimates = withdraw_estimates(estimates, full.unknowns, final.raw)
-    elif unusable := _unusable_parameters(has_unknown_grips, checked, profiles) | set(limits) | set(corrected.unusable):
+    elif unusable := _unusable_parameters(full, checked, profiles) | set(limits) | set(corrected.unusable):
         estimates = withdraw_estimates(estimates, full.unknowns, final.raw, unusable)
     warnings += [reason for reason in (misfit_reason, outcome.unfinished_reason) if reason]
     warnings += warn_of_skew(estimates, [name for name in checked.curved_parameters if name not in profiles])
@@ -362,13 +361,18 @@ def _assemble_result(
     )
 
 
-def _unusable_parameters(has_unknown_grips: bool, checked: LinearityCheck, profiles: Mapping[str, Any]) -> set[str]:
+def _has_unknown_grips(objective: Objective) -> bool:
+    return any(isinstance(nuisance, GripExtent) for nuisance in objective.nuisances)
+
+
+def _unusable_parameters(full: Objective, checked: LinearityCheck, profiles: Mapping[str, Any]) -> set[str]:
     """Return parameters that are no estimates: their slopes fail, or change where the grips are unknown, too.
 
     Flat directions towards the errors of a bench are curved. At a rig with a clamp E h ended at 3.3 ± 0.6 of the truth,
     with slopes that change within a standard error (``studies strangers``, seed 6).
     """
-    curved = set(checked.curved_parameters) - set(profiles) if has_unknown_grips else set()
+    known = {u.name for u in full.unknowns if u.measured}
+    curved = set(checked.curved_parameters) - set(profiles) - known if _has_unknown_grips(full) else set()
     return set(checked.unusable_parameters) | curved
 
 
