@@ -242,7 +242,7 @@ def _parse_fit(content: dict[str, Any]) -> SavedFit:
         stds={name: check_number(parameters[name]["std"], 0.0, f"{name}'s std") for name in correlation},
         unrecorded_settings=[str(name) for name in model["unrecorded_settings"]],
         has_start_model="start_model" in model,
-        unidentified=tuple(name for name in correlation if parameters[name]["identifiable"] is not True),
+        unidentified=tuple(name for name in correlation if parameters[name].get("identifiable") is False),
         correlation=matrix,
         thickness=None if thickness is None else check_number(thickness, 0.0, "thickness"),
         misfit_rms=math.nan if misfit is None else check_number(misfit, 0.0),
