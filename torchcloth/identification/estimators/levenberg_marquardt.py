@@ -271,36 +271,37 @@ def _step(
 ) -> tuple[Iterate | None, float, float]:
     """(accepted point or None, actual over predicted decrease, next damping)."""
     gradient, hessian = normal_equations(problem, at)
-    low, high = _step_bounds(problem, at)
+    cost_here = robust_cost(problem, at, at.raw, at.linear.residual)
+    bounds = _step_bounds(problem, at)
     for _ in range(settings.max_trials):
-        step = solve_box_qp(hessian + damping * torch.diag(hessian.diagonal()), -gradient, low, high)
-        trial = _try_step(problem, at, step)
+        step = solve_box_qp(hessian + damping * torch.diag(hessian.diagonal()), -gradient, *bounds)
+        trial = _try_step(problem, at, step, cost_here)
         if trial is not None and trial.decrease > 0:
             predicted = -float(gradient @ step + 0.5 * step @ hessian @ step)
             gain_ratio = trial.decrease / max(predicted, 1e-12)
             if gain_ratio > settings.min_gain_to_double and trial.decrease > settings.min_decrease_to_double:
-                trial = _extend_step(problem, at, trial, settings.max_doublings)
+                trial = _extend_step(problem, at, trial, cost_here, bounds, settings.max_doublings)
             damping = max(damping / settings.damping_decrease, settings.min_damping)
             return _broyden_update(problem, at, trial), gain_ratio, damping
         damping = max(settings.damping_increase * damping, settings.min_damping_after_rejection)
     return None, 0.0, damping
 
 
-def _try_step(problem: Problem, at: Iterate, step: Tensor) -> TrialStep | None:
-    """Evaluate a step; None where the simulation fails."""
+def _try_step(problem: Problem, at: Iterate, step: Tensor, cost_here: float) -> TrialStep | None:
+    """Evaluate a step from a point with a robust cost; None where the simulation fails."""
     try:
         residual, error_group = problem.evaluate(at.raw + step)
     except (SimulationDiverged, UnstableStep):
         return None
-    cost_here = robust_cost(problem, at, at.raw, at.linear.residual)
     return TrialStep(step, residual, error_group, cost_here - robust_cost(problem, at, at.raw + step, residual))
 
 
-def _extend_step(problem: Problem, at: Iterate, trial: TrialStep, max_doublings: int) -> TrialStep:
+def _extend_step(
+    problem: Problem, at: Iterate, trial: TrialStep, cost_here: float, bounds: tuple[Tensor, Tensor], max_doublings: int
+) -> TrialStep:
     """Double a step for as long as the cost falls farther."""
-    low, high = _step_bounds(problem, at)
     for _ in range(max_doublings):
-        longer = _try_step(problem, at, (2 * trial.step).clamp(low, high))
+        longer = _try_step(problem, at, (2 * trial.step).clamp(*bounds), cost_here)
         if longer is None or not longer.decrease > trial.decrease:
             break
         trial = longer

@@ -279,11 +279,8 @@ class Objective:
 
     def _simulate_cloth(self, raw: Tensor, i: int) -> Frames:
         """Simulate episode ``i`` as an observer without errors sees it."""
-        (cloth, stretched), episode = self._gripped_cloth(raw, i), self._initial_episode(raw, i)
-        fabric = raw[: len(self.unknowns)]
-        if stretched is None:
-            return simulate(cloth, self.unknowns, fabric, episode, self.dt)
-        return stretched.view(simulate(cloth, self.unknowns, fabric, stretched.take_start(episode), self.dt))
+        cloth, episode, view = self._gripped_episode(raw, i)
+        return view(simulate(cloth, self.unknowns, raw[: len(self.unknowns)], episode, self.dt))
 
     @torch.no_grad()
     def simulate_cloth(self, raw: Tensor) -> list[Frames]:
@@ -304,11 +301,16 @@ class Objective:
         return [None if None in frames else list(frames) for frames in zip(*by_episode, strict=True)]
 
     def _simulate_fabrics(self, raw: Tensor, fabrics: Tensor, i: int) -> list[Frames | None]:
+        cloth, episode, view = self._gripped_episode(raw, i)
+        simulated = simulate_all(cloth, self.unknowns, fabrics, episode, self.dt)
+        return [None if frames is None else view(frames) for frames in simulated]
+
+    def _gripped_episode(self, raw: Tensor, i: int) -> tuple[Cloth, Episode, Callable[[Frames], Frames]]:
+        """Return the cloth as it is gripped in episode ``i``, the episode for it, and how its frames are seen."""
         (cloth, stretched), episode = self._gripped_cloth(raw, i), self._initial_episode(raw, i)
         if stretched is None:
-            return simulate_all(cloth, self.unknowns, fabrics, episode, self.dt)
-        frames = simulate_all(stretched.cloth, self.unknowns, fabrics, stretched.take_start(episode), self.dt)
-        return [None if f is None else stretched.view(f) for f in frames]
+            return cloth, episode, lambda frames: frames
+        return cloth, stretched.take_start(episode), stretched.view
 
     def _gripped_cloth(self, raw: Tensor, i: int) -> tuple[Cloth, StretchedCloth | None]:
         """Return the cloth as it is gripped in episode ``i``, and where the pattern is stretched for that."""

@@ -42,9 +42,8 @@ class ModelErrors:
 
 
 MODEL_ERRORS = ModelErrors()
-SAME_SIMULATOR = ModelErrors(
-    bending=0.0, other=0.0, grip_compliance=0.0
-)  # of recordings that this library simulated, with the same laws
+# of recordings that this library simulated, with the same laws
+SAME_SIMULATOR = ModelErrors(bending=0.0, other=0.0, grip_compliance=0.0)
 
 
 def add_model_error(

@@ -195,11 +195,8 @@ def mesh_correction(objective: Objective, final: levenberg_marquardt.Iterate, sc
     if promised < MIN_CHECKED_DECREASE:
         return MeshCorrection(step, math.nan)
     moved = _fine_residual(final.linear, fine.evaluate_all(there))
-    costs = (
-        levenberg_marquardt.robust_cost(problem, final, raw, rows)
-        for raw, rows in ((final.raw, residual), (there, moved))
-    )
-    before, after = costs
+    before = levenberg_marquardt.robust_cost(problem, final, final.raw, residual)
+    after = levenberg_marquardt.robust_cost(problem, final, there, moved)
     return MeshCorrection(step, (before - after) / promised)
 
 
