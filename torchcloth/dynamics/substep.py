@@ -80,7 +80,7 @@ def step(
         if contact_candidates is None:
             contact_candidates = find_contact_candidates(model, grid, state.x)
         if len(contact_candidates.active):
-            directors = compute_director_forces(model, grid, contact_candidates, state, s, dt)
+            directors = compute_director_forces(model, grid, contact_candidates, state, s, dt, substep)
             stress = add_director_stress(contact_candidates, stress, directors)
 
     added_mass_ratio = compute_added_mass_ratio(model, s, state.x)

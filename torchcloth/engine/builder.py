@@ -145,6 +145,7 @@ class SubstepBuilder:
         variables = {key: value for key, value in internal_variables(model, state).items() if key not in in_torch}
         self.memory = {key: StateField(*self.program.state(*value.shape[-2:])) for key, value in variables.items()}
         self.dt = self.program.per_substep(1)
+        self.grid_shift: Field | None = None  # of contact
         self.mass = self.parameter(model.mass)
         self.force = self.program.temporary(self.vertices, 3)
         self.vertex_forces: list[tuple[str, tuple[Field, ...]]] = []

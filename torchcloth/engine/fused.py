@@ -11,6 +11,7 @@ from torch.utils import checkpoint as torch_checkpoint
 
 from .._utils.torch_modes import under_torch_transform
 from ..boundaries import PrescribedMotion
+from ..dynamics.contact import grid_shifts
 from ..dynamics.contact.self_contact import SUBSTEPS_PER_CHECKPOINT
 from ..dynamics.forces import Impulses, add_impulses
 from ..dynamics.model import Model
@@ -66,10 +67,14 @@ class FusedEngine:
         substeps: int,
         first: int = 0,
         checkpoint: bool = True,
+        first_substep: int = 0,
     ) -> tuple[ClothState, Tensor | None, Impulses]:
-        """Run substeps as ``dynamics.substep.rollout_segment`` does; ``checkpoint`` as for ``rollout``."""
+        """Run substeps as ``dynamics.substep.rollout_segment`` does; ``checkpoint`` as for ``rollout``.
+
+        ``first_substep``: as in ``Grid``.
+        """
         steps = torch.full((first + substeps,), dt, dtype=torch.float64)
-        fixed, rows = self.coefficients(_batch(state)), self.substep_inputs(state, prescribed, steps)
+        fixed, rows = self.coefficients(_batch(state)), self.substep_inputs(state, prescribed, steps, first_substep)
         if self.torch_parts is None:
             inputs = fixed | _substep_rows(rows, first, first + substeps)
             return self._call(state, compensation, inputs, substeps, checkpoint)
@@ -145,10 +150,11 @@ class FusedEngine:
         steps: Tensor,
         prescribed: Mapping[str, PrescribedMotion],
         compensation: Tensor | None = None,
+        first_substep: int = 0,
     ) -> Job:
         """Return the program with all numbers of a call; not for models with parts in torch."""
         batch, program = _batch(state), self.builder.program
-        inputs = self.coefficients(batch) | self.substep_inputs(state, prescribed, steps)
+        inputs = self.coefficients(batch) | self.substep_inputs(state, prescribed, steps, first_substep)
         variables = conversion.state_inputs(self.builder, state, compensation)
         inputs |= conversion.flatten_batch(self.builder, variables, batch)
         return Job(program, {field: inputs[field] for field in program.inputs}, batch.numel(), len(steps))
@@ -162,10 +168,12 @@ class FusedEngine:
         return self._coefficients
 
     def substep_inputs(
-        self, state: ClothState, prescribed: Mapping[str, PrescribedMotion], steps: Tensor
+        self, state: ClothState, prescribed: Mapping[str, PrescribedMotion], steps: Tensor, first_substep: int
     ) -> dict[Field, Tensor]:
-        """Return the inputs with a row for every substep; ``steps``: [substeps] s."""
+        """Return the inputs with a row for every substep; ``steps``: [substeps] s, ``first_substep`` as in ``Grid``."""
         inputs = {**conversion.prescribed_inputs(self.builder, prescribed), self.builder.dt: steps.unsqueeze(-1)}
+        if self.builder.grid_shift is not None:
+            inputs[self.builder.grid_shift] = grid_shifts(first_substep, len(steps))
         return conversion.flatten_batch(self.builder, inputs, _batch(state))
 
     def _run_with_torch(

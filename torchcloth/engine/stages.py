@@ -18,7 +18,7 @@ class ContactSearch(NamedTuple):
     """Search for the triangles that may touch another layer, and layout of the grid; see ``csrc/contact.h``.
 
     Attributes:
-        fields: positions, lowest node of each point, fields of the nodes, fields of the points.
+        fields: positions, lowest node of each point, shift of the grid, fields of the nodes, fields of the points.
         corners: [3, E] int32, vertices of the triangles.
         barycentric: [S, 3] float64, barycentric coordinates of a triangle's contact points.
         lengths: (spacing, search skin, reach) of the grid [m].

@@ -43,6 +43,7 @@ class FusedTangents:
         prescribed: Mapping[str, PrescribedMotion],
         prescribed_tangents: Mapping[str, PrescribedMotion],
         substeps: int,
+        first_substep: int = 0,
     ) -> tuple[ClothState, Tensor | None, ClothState, Impulses, Impulses]:
         """Run substeps with tangents.
 
@@ -54,6 +55,7 @@ class FusedTangents:
             prescribed: motions by boundary.
             prescribed_tangents: their tangents, by boundary.
             substeps: how many.
+            first_substep: as in ``Grid``.
 
         Returns:
             State, compensation, tangents of the state [K, ...], impulses and their tangents after the substeps.
@@ -61,7 +63,7 @@ class FusedTangents:
         builder, batch = self.fused.builder, state.x.shape[:-2]
         program = builder.program
         steps = torch.full((substeps,), dt, dtype=torch.float64)
-        inputs = self.fused.job(state, steps, prescribed, compensation).inputs
+        inputs = self.fused.job(state, steps, prescribed, compensation, first_substep).inputs
         tangents = conversion.state_inputs(builder, state_tangent) | self._coefficients(state, prescribed)
         if prescribed_tangents:
             motions = conversion.prescribed_inputs(builder, prescribed_tangents)

@@ -104,6 +104,12 @@ def simulate_all(
     return out
 
 
+def shared_step(cloth: Cloth, unknowns: Sequence[Unknown], raw: Tensor) -> float | None:
+    """Return a substep [s] that is stable at all N points ``raw`` [N, K] where there is a stable one; else None."""
+    steps = [_stable_step(cloth, unknowns, point) for point in raw]
+    return min((step for step in steps if step > 0), default=None)
+
+
 def _stable_step(cloth: Cloth, unknowns: Sequence[Unknown], raw: Tensor) -> float:
     """Return the stable substep [s] at a point; 0 where there is none."""
     entries = make_state_entries(unknowns, raw.to(cloth.areal_density.raw))

@@ -65,6 +65,7 @@ class FrameInterval(NamedTuple):
         fused: the engine that runs them; None: the reference.
         prescribed: ``motion`` on the substeps, where it has been sampled already.
         graphs: CUDA graphs of the reference's substeps; None: they are launched one by one.
+        first_substep: number of the first substep in the whole simulation.
     """
 
     model: Model
@@ -75,6 +76,7 @@ class FrameInterval(NamedTuple):
     fused: FusedEngine | None = None
     prescribed: Mapping[str, PrescribedMotion] | None = None
     graphs: GraphedRollout | None = None
+    first_substep: int = 0
 
     @property
     def dt(self) -> float:
@@ -143,9 +145,9 @@ class RolloutSchedule(NamedTuple):
                 check_substeps(span, longest_step)
                 needed = ceil(span / longest_step - 1e-9)
             if needed > interval.count:
-                yield interval._replace(count=needed)
+                yield interval._replace(count=needed, first_substep=first)
             else:
-                yield interval._replace(prescribed=_slice(prescribed, first, last))
+                yield interval._replace(prescribed=_slice(prescribed, first, last), first_substep=first)
             first = last
 
     def iterate_blocks(self) -> Iterator[tuple[list[FrameInterval], dict[str, PrescribedMotion]]]:
@@ -277,7 +279,9 @@ def advance_interval(
     if interval.fused is None:
         state, compensation, total = _run_reference(interval, state, compensation, prescribed, checkpoint)
     else:
-        run = partial(interval.fused.rollout_segment, checkpoint=checkpoint)
+        run = partial(
+            interval.fused.rollout_segment, checkpoint=checkpoint, first_substep=interval.first_substep
+        )
         state, compensation, total = run(state, compensation, interval.dt, prescribed, interval.count)
     check_finite(interval, start, state)
     return state, compensation, total
@@ -291,8 +295,10 @@ def _run_reference(
     checkpoint: bool,
 ) -> tuple[ClothState, Tensor | None, Impulses]:
     total: Impulses = {}
-    recomputes = checkpoint and may_recompute()
-    model = freeze_parameters(interval.model) if recomputes else interval.model
+    recomputes, model = checkpoint and may_recompute(), interval.model
+    if model.grid is not None:
+        model = model._replace(grid=model.grid._replace(first_substep=interval.first_substep))
+    model = freeze_parameters(model) if recomputes else model
     graphs = None if under_torch_transform() else interval.graphs
     chunk = segment_length(interval.count) if graphs is not None and graphs.is_enabled else SUBSTEPS_PER_CHECKPOINT
     for first in range(0, interval.count, chunk):

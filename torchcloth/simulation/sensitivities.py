@@ -101,7 +101,14 @@ class _TangentRunner:
             start, prescribed = state, interval.sample_motion()
             prescribed_tangents = poses.tangents(interval, state.x.ndim - 2)
             state, compensation, tangent, impulse, impulse_tangent = engine.rollout(
-                state, compensation, tangent, interval.dt, prescribed, prescribed_tangents, interval.count
+                state,
+                compensation,
+                tangent,
+                interval.dt,
+                prescribed,
+                prescribed_tangents,
+                interval.count,
+                interval.first_substep,
             )
             check_finite(interval, start, state)
             self.schedule.check_extent(state)

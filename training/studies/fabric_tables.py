@@ -92,7 +92,7 @@ def _contact_notes(result: Mapping[str, Any]) -> list[str]:
 
 def _pressed(result: Mapping[str, Any]):
     out = make_table(
-        f"Press, {result['presses']} trials a fabric, plates where the model has them; and elsewhere in the grid",
+        f"Press, {result['presses']} trials a fabric, plates where the model has them; and elsewhere in the grid, turned",
         "fabric",
         "",
         "truth",
@@ -120,13 +120,13 @@ def _pressed(result: Mapping[str, Any]):
 
 
 def _placement_note(result: Mapping[str, Any]) -> str:
-    """Return a note on the grid's influence, which the error bars of the press do not include."""
+    """Return a note on the grid's influence."""
     every = {s: [entry[s]["elsewhere"]["worst"] for entry in result["fabrics"].values()] for s in LAYER_SYMBOLS}
     worst = {s: max((abs(x) for x in entry if x is not None), default=None) for s, entry in every.items()}
     off = ", ".join(f"{symbol} is off by up to {format_percent(share)}" for symbol, share in worst.items())
     return (
-        "These errors include the sensors only. Layers pressed to the same distance elsewhere in the contact grid give "
-        f"another force: {off}. k and γ depend on the grid as much as on the fabric.\n"
+        f"Layers that are pressed elsewhere in the contact grid, and turned, give nearly the same force: {off}. The "
+        "error bars of k and γ count 3 % for it.\n"
     )
 
 

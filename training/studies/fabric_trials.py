@@ -59,7 +59,8 @@ class Scale(NamedTuple):
         fabrics: names.
         pulls: stretching trials of each fabric.
         detail: of the stretching trials.
-        presses: number of presses of each kind.
+        presses: number of presses where the model has its plates.
+        places: number of presses elsewhere in the grid.
         cells: along a side of a pressed layer, for truth and model.
     """
 
@@ -67,15 +68,16 @@ class Scale(NamedTuple):
     pulls: tuple[Pull, ...]
     detail: Detail
     presses: int
+    places: int
     cells: tuple[int, int]
 
     def settings(self) -> dict[str, Any]:
         """Return the settings that a case depends on; fabrics and pulls may be added later."""
-        return {"detail": list(self.detail), "cells": list(self.cells), "refined": True}
+        return {"detail": list(self.detail), "cells": list(self.cells), "refined": True, "turned": True}
 
 
-FULL_SCALE = Scale(tuple(FABRICS), ALL_PULLS, Detail(), 3, (6, 4))
-FAST_SCALE = Scale(("cotton", "wool"), (ALL_PULLS[3], ALL_PULLS[5], ALL_PULLS[8]), Detail(0.05, 9, 80), 1, (3, 2))
+FULL_SCALE = Scale(tuple(FABRICS), ALL_PULLS, Detail(), 3, 4, (6, 4))
+FAST_SCALE = Scale(("cotton", "wool"), (ALL_PULLS[3], ALL_PULLS[5], ALL_PULLS[8]), Detail(0.05, 9, 80), 1, 2, (3, 2))
 
 
 def sheet_fabric(name: str) -> Fabric:
@@ -112,14 +114,14 @@ def other_cases(scale: Scale) -> dict[str, Case]:
     out: dict[str, Case] = {}
     for name in scale.fabrics:
         out[f"{name}-director"] = partial(fit_contact_from_stretch, name, scale)
-        for i in range(scale.presses):
-            out[f"{name}-press-{i + 1:02d}"] = partial(fit_press, name, i, scale, False)
-            out[f"{name}-elsewhere-{i + 1:02d}"] = partial(fit_press, name, i, scale, True)
+        for kind, count in (("press", scale.presses), ("elsewhere", scale.places)):
+            for i in range(count):
+                out[f"{name}-{kind}-{i + 1:02d}"] = partial(fit_press, name, i, scale, kind == "elsewhere")
     return out
 
 
 def seed_of(name: str, index: int) -> int:
-    """Return the seed of a trial's noise; the three places elsewhere in the grid are the same for all fabrics."""
+    """Return the seed of a trial's noise, and of the place of a press in the grid."""
     return 100 * list(FABRICS).index(name) + index
 
 
@@ -175,11 +177,12 @@ def fit_contact_from_stretch(name: str, scale: Scale) -> dict[str, Any]:
 
 
 def fit_press(name: str, index: int, scale: Scale, elsewhere: bool) -> dict[str, Any]:
-    """Simulate and fit a press; ``elsewhere`` puts the truth's plates at another place in the contact grid."""
+    """Simulate and fit a press; ``elsewhere``: the truth's plates lie elsewhere in the contact grid, and turned."""
     properties, seed = pressed_layer(name), seed_of(name, 50 + index)
-    offset = np.random.default_rng(1000 + index).uniform(0, GRID_SPACING_M, 3) * elsewhere
     fine, coarse = scale.cells
-    recording = pressing.record(properties, Plates(fine + index % 2, GRID_SPACING_M, tuple(offset)), seed)
+    truth = Plates(fine + index % 2, GRID_SPACING_M)
+    truth = truth.moved_randomly(np.random.default_rng(1000 + seed)) if elsewhere else truth
+    recording = pressing.record(properties, truth, seed)
     start = {
         "contact_stiffness": START_FACTOR * properties.contact_stiffness,
         "shear_stiffness": properties.shear_stiffness / START_FACTOR,
@@ -196,7 +199,7 @@ def fit_press(name: str, index: int, scale: Scale, elsewhere: bool) -> dict[str,
         model_errors=SAME_SIMULATOR,
         exact_bench=True,
     )
-    facts = {"offset": [float(x) for x in offset], "misfit": fit.fit["force_rms_after"]}
+    facts = {"offset": list(truth.offset), "turn": list(truth.turn), "misfit": fit.fit["force_rms_after"]}
     return {
         "fabric": name,
         **facts,

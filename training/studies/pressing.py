@@ -11,6 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
+from scipy.spatial.transform import Rotation
 
 import torchcloth as tc
 from torchcloth import recordings as rec
@@ -20,7 +21,7 @@ from .synthetic_sheets import simulate_readings
 
 LAYER_SIDE_M = 0.05
 INITIAL_DISTANCE_SPACINGS, PRESSED_DISTANCE_SPACINGS = 2.2, 0.8  # of the plates, in grid spacings
-SLIDE_SPACINGS = 0.4  # sideways motion of the upper plate, in grid spacings
+SLIDE_SPACINGS = 1.2  # sideways motion of the upper plate, in grid spacings
 DURATION_S = 0.016  # a third for pressing, then sliding
 FORCE_SAMPLES = 25
 FORCE_NOISE_N = 0.05
@@ -46,11 +47,23 @@ class Plates(NamedTuple):
         cells: along a side.
         spacing: of the contact grid [m].
         offset: position of the plates in the grid [m].
+        turn: rotation vector of the plates in the grid [rad].
     """
 
     cells: int
     spacing: float
     offset: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    turn: tuple[float, float, float] = (0.0, 0.0, 0.0)
+
+    @property
+    def rotation(self) -> Rotation:
+        """The turn as a rotation."""
+        return Rotation.from_rotvec(self.turn)
+
+    def moved_randomly(self, rng: np.random.Generator) -> Plates:
+        """Return plates at any place and in any attitude in the grid."""
+        turn = Rotation.random(random_state=rng).as_rotvec()
+        return self._replace(offset=tuple(rng.uniform(0, self.spacing, 3)), turn=tuple(turn))
 
 
 def build_layers(layer: Layer, plates: Plates) -> tc.Cloth:
@@ -58,7 +71,7 @@ def build_layers(layer: Layer, plates: Plates) -> tc.Cloth:
     sheet = tc.meshes.rectangle(LAYER_SIDE_M, LAYER_SIDE_M, resolution=(plates.cells + 1, plates.cells + 1))
     count, up = len(sheet.vertices), np.array([0.0, 0.0, INITIAL_DISTANCE_SPACINGS * plates.spacing])
     mesh = tc.meshes.Mesh.build(
-        np.concatenate([sheet.vertices, sheet.vertices + up]) + plates.offset,
+        plates.rotation.apply(np.concatenate([sheet.vertices, sheet.vertices + up])) + plates.offset,
         np.concatenate([sheet.faces, sheet.faces + count]),
     )
     material = tc.materials.AEP(**{k: v for k, v in layer._asdict().items() if k != "density"})
@@ -77,13 +90,17 @@ def plate_motion(plates: Plates) -> dict[str, rec.GripperMotion]:
         INITIAL_DISTANCE_SPACINGS + (PRESSED_DISTANCE_SPACINGS - INITIAL_DISTANCE_SPACINGS) * down
     ) * plates.spacing
     above[:, 0] = SLIDE_SPACINGS * aside * plates.spacing
-    facing, closed = np.tile([1.0, 0, 0, 0], (len(t), 1)), np.ones(len(t), bool)
+    quaternion_wxyz = np.roll(plates.rotation.as_quat(), 1)
+    facing, closed = np.tile(quaternion_wxyz, (len(t), 1)), np.ones(len(t), bool)
     paths = {"below": np.zeros((len(t), 3)), "above": above}
-    return {name: rec.GripperMotion(t, x + plates.offset, facing, closed) for name, x in paths.items()}
+    return {
+        name: rec.GripperMotion(t, plates.rotation.apply(x) + plates.offset, facing, closed)
+        for name, x in paths.items()
+    }
 
 
 def record(layer: Layer, plates: Plates, seed: int) -> rec.Recording:
-    """Simulate the experiment and return a recording without cloth."""
+    """Simulate the experiment and return a recording without cloth, in the frame of the plates."""
     rng = np.random.default_rng(seed)
     cloth, paths = build_layers(layer, plates), plate_motion(plates)
     recording = rec.Recording(
@@ -94,11 +111,10 @@ def record(layer: Layer, plates: Plates, seed: int) -> rec.Recording:
     knots = paths["above"].t
     with torch.no_grad():
         out = cloth(cloth.rest_state(), replay(recording), knots.tolist(), dt=STEP_FRACTION * cloth.stable_step())
+    forces = {name: simulate_readings(out, name, knots, FORCE_NOISE_N, rng) for name in paths}
     measured = {
-        name: replace(
-            m, force=simulate_readings(out, name, knots, FORCE_NOISE_N, rng), position=m.position - plates.offset
-        )
-        for name, m in paths.items()
+        name: replace(m, force=plates.rotation.inv().apply(forces[name]))
+        for name, m in plate_motion(plates._replace(offset=(0.0, 0.0, 0.0), turn=(0.0, 0.0, 0.0))).items()
     }
     return replace(recording, grippers=measured)
 

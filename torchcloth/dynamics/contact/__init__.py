@@ -1,14 +1,14 @@
 """Contact between layers of cloth: contact points, the grid between them, and the transfer of momentum."""
 
+from .compression import COMPRESSION_PER_SPACING, closing_rates, compression_at, layer_pressure
 from .grid import (
-    APPROACH_PER_COMPRESSION_SPACINGS,
-    COMPRESSION_ONSET_SPACINGS,
     FOLD_PATH_RATIO,
     INTERACTION_RANGE_SPACINGS,
     REST_GAP_SPACINGS,
     SEARCH_SKIN_SPACINGS,
     Contact,
     Grid,
+    grid_shifts,
 )
 from .transfer import (
     Stencil,
@@ -21,8 +21,7 @@ from .transfer import (
 )
 
 __all__ = [
-    "APPROACH_PER_COMPRESSION_SPACINGS",
-    "COMPRESSION_ONSET_SPACINGS",
+    "COMPRESSION_PER_SPACING",
     "FOLD_PATH_RATIO",
     "INTERACTION_RANGE_SPACINGS",
     "REST_GAP_SPACINGS",
@@ -31,6 +30,10 @@ __all__ = [
     "Grid",
     "Stencil",
     "affine_momentum",
+    "closing_rates",
+    "compression_at",
+    "grid_shifts",
+    "layer_pressure",
     "place_on_grid",
     "stencil_nodes",
     "sum_on_nodes",

@@ -14,13 +14,12 @@ from torch import Tensor
 from ..._utils.constants import STANDARD_GRAVITY_M_PER_S2
 from ...errors import InvalidInput
 from ...meshes import Mesh
+from .compression import layer_pressure
 from .neighbours import find_non_adjacent_triangles, find_overlapping_triangles
 
-# Lengths in grid spacings. COMPRESSION_ONSET and APPROACH_PER_COMPRESSION are measured (tests/physics/test_contact.py).
+# Lengths in grid spacings.
 SEARCH_SKIN_SPACINGS = 2.0  # by how much layers may approach each other before candidates are searched again
 INTERACTION_RANGE_SPACINGS = 4.0  # splines of points farther apart share no node of any weight
-COMPRESSION_ONSET_SPACINGS = 2.26  # distance at which approaching layers begin to compress each other's directors
-APPROACH_PER_COMPRESSION_SPACINGS = 3.5  # approach from there on for each unit of compression 1 - R33
 REST_GAP_SPACINGS = 1.4  # between layers at rest, with the default free compression
 MAX_POINT_DISTANCE_SPACINGS = 1.4  # between corners of sub-triangles: no hole between points exceeds 0.7 spacings
 # The grid wraps at this multiple of the longest path along the cloth, so that layers never meet their own images.
@@ -30,6 +29,20 @@ WARN_POINTS_PER_TRIANGLE = 64  # usual are 1 to 4
 MIN_MEETING_PAIR_FRACTION = 0.2  # of all pairs of triangles, those that can meet, for contact that is on by default
 WARN_UNSEEN_LAYER_FRACTION = 0.5  # of the triangles in layers, those that do not see the other layer
 FOLD_PATH_RATIO = 1.7  # layers are folded on each other where the path along the cloth is so much longer than in space
+
+# Steps of the R3 sequence (Roberts 2018): powers of 1 / 1.2207, where 1.2207 solves x^4 = x + 1.
+SHIFT_STEPS_SPACINGS = (0.8191725133961645, 0.6710436067037893, 0.5497004779019703)
+
+
+def grid_shifts(first: int, count: int) -> Tensor:
+    """Return where the grid lies at some substeps, [count, 3] float64 in spacings from 0 to 1.
+
+    The grid moves in every substep, so that contact does not depend on where layers lie in it. Fluid simulations by
+    particles shift their cells for the same reason (Ihle and Kroll 2001). The places fill the cell evenly, better than
+    random ones would.
+    """
+    substep = torch.arange(first, first + count, dtype=torch.float64)
+    return (substep[:, None] * torch.tensor(SHIFT_STEPS_SPACINGS, dtype=torch.float64)) % 1.0
 
 
 class Grid(NamedTuple):
@@ -46,6 +59,7 @@ class Grid(NamedTuple):
         damping: of the collision [s].
         non_adjacent: [E, E] bool, pairs of triangles that are not neighbours along the cloth; None: every triangle
             always takes part.
+        first_substep: number, in the whole simulation, of the substep that row 0 of the prescribed motion belongs to.
     """
 
     points: Tensor
@@ -56,6 +70,11 @@ class Grid(NamedTuple):
     free_compression: float
     damping: float
     non_adjacent: Tensor | None
+    first_substep: int = 0
+
+    def shift(self, substep: int) -> Tensor:
+        """Return where the grid lies, [3] in spacings, at the substep of a row of the prescribed motion."""
+        return grid_shifts(self.first_substep + substep, 1)[0]
 
     @property
     def max_extent(self) -> float:
@@ -66,11 +85,6 @@ class Grid(NamedTuple):
     def can_act(self) -> bool:
         """Whether at least a fifth of all pairs of triangles are no neighbours, so that layers can meet."""
         return self.non_adjacent is None or float(self.non_adjacent.double().mean()) >= MIN_MEETING_PAIR_FRACTION
-
-    @property
-    def _largest_compression(self) -> float:
-        """Compression 1 - R33 that presses where two layers lie in one place."""
-        return COMPRESSION_ONSET_SPACINGS / APPROACH_PER_COMPRESSION_SPACINGS - self.free_compression
 
     def find_layers(self, mesh: Mesh) -> np.ndarray:
         """Return pairs of triangles [N, 2] that lie over each other, within two gaps."""
@@ -94,7 +108,8 @@ class Grid(NamedTuple):
             areal_density: [kg/m^2], of any shape.
         """
         weakest, weight = float(stiffness.min()), STANDARD_GRAVITY_M_PER_S2 * float(areal_density.max())
-        needed = weight * APPROACH_PER_COMPRESSION_SPACINGS * self.spacing / self._largest_compression**2
+        largest = layer_pressure(np.linspace(0, REST_GAP_SPACINGS, 29), self.free_compression).max()
+        needed = weight * self.spacing / largest
         if weakest < needed:
             yield (
                 f"contact: a stiffness k h of {weakest:.3g} N/m cannot carry the cloth's weight of {weight:.3g} Pa, so "
@@ -124,8 +139,8 @@ class Grid(NamedTuple):
 class Contact:
     """Discretisation of the contact between layers of cloth, independent of the mesh.
 
-    Layers come to rest 1.4 grid spacings apart (1.3 to 1.5, for pressures from a fabric's weight to a hundred times
-    that); layers that start nearer stay nearer. Only triangles near another layer take part and cost time. Triangles
+    Layers come to rest 1.4 grid spacings apart, wherever they lie in the grid, and under a hundred times a fabric's
+    weight 1.0 spacings apart (``compression.layer_pressure``); layers that start nearer stay nearer. Only triangles near another layer take part and cost time. Triangles
     within about 10 spacings plus 3 edges along the cloth count as neighbours and do not interact: ``print(cloth)`` says
     how far. A coarse cloth needs a finer mesh before its folds can touch.
 
@@ -139,8 +154,8 @@ class Contact:
             spacing needs. Sparser points would let layers pass through each other.
         damping: of the collision [s] (Hunt and Crossley 1975). The pressure grows as layers close and falls as they
             part, by damping times the rate of the director's compression. 0: layers bounce like rubber.
-        free_compression: compression 1 - R33 of the director at which layers begin to press. The splines of layers 2.3
-            spacings apart still overlap: with 0, as published, layers rest there.
+        free_compression: compression 1 - R33 of the director at which layers begin to press. The splines of layers up
+            to 3 spacings apart overlap: with 0, as published, layers rest 2.2 spacings apart.
         everywhere: all triangles always take part, as in material point methods; for comparison.
 
     Raises:
@@ -150,7 +165,7 @@ class Contact:
     spacing: float | None = None
     subdivisions: int | None = None
     damping: float = 0.1
-    free_compression: float = 0.25
+    free_compression: float = 0.15
     everywhere: bool = False
 
     def __post_init__(self) -> None:

@@ -17,13 +17,8 @@ from ..._utils.linalg import EXACT_CDIST_MODE, cross, dot, matvec
 from ...types import ClothState, Surface
 from ..kinematics import centroids, corners, surface
 from ..model import Model
-from .grid import (
-    APPROACH_PER_COMPRESSION_SPACINGS,
-    COMPRESSION_ONSET_SPACINGS,
-    INTERACTION_RANGE_SPACINGS,
-    SEARCH_SKIN_SPACINGS,
-    Grid,
-)
+from .compression import COMPRESSION_PER_SPACING, RANGE_SPACINGS, compression_at
+from .grid import INTERACTION_RANGE_SPACINGS, SEARCH_SKIN_SPACINGS, Grid
 from .transfer import Stencil, place_on_grid, transfer_director_forces, velocity_gradient
 
 # Of a long interval: memory grows as frames + SUBSTEPS_PER_CHECKPOINT, for one extra forward pass. Candidates are
@@ -113,7 +108,7 @@ def initial_directors(model: Model, grid: Grid, x: Tensor) -> Tensor:
 def _unpressed_compression(grid: Grid, non_adjacent: Tensor, centre: Tensor, n: Tensor) -> Tensor:
     """Return the compression [..., E, 1] at which layers as near as these triangles do not yet press."""
     side = (grid.reach - (INTERACTION_RANGE_SPACINGS + SEARCH_SKIN_SPACINGS) * grid.spacing) / 2
-    pressing_range = COMPRESSION_ONSET_SPACINGS * grid.spacing + side  # for pairs in any direction
+    pressing_range = RANGE_SPACINGS * grid.spacing + side  # for pairs in any direction
     compressions = []
     for points, normals in zip(centre.reshape(-1, *n.shape[-2:]), n.reshape(-1, *n.shape[-2:]), strict=True):
         fixed = points.detach()  # which pairs are near has no derivative; how near they are has
@@ -122,7 +117,7 @@ def _unpressed_compression(grid: Grid, non_adjacent: Tensor, centre: Tensor, n: 
         between = points[over] - points[under]
         height = dot(between, normals[under]).abs()
         is_lateral = (dot(between, between) - height**2).clamp(min=0).sqrt() > side
-        compression = (COMPRESSION_ONSET_SPACINGS - height / grid.spacing) / APPROACH_PER_COMPRESSION_SPACINGS
+        compression = compression_at(height / grid.spacing)
         compression = compression.masked_fill(is_lateral, 0.0).clamp(0, grid.free_compression)
         largest = points.new_zeros(len(points), 1).scatter_reduce(0, over.unsqueeze(-1), compression, "amax")
         compressions.append(largest)
@@ -130,9 +125,11 @@ def _unpressed_compression(grid: Grid, non_adjacent: Tensor, centre: Tensor, n: 
 
 
 def compute_director_forces(
-    model: Model, grid: Grid, candidates: ContactCandidates, state: ClothState, s: Surface, dt: float
+    model: Model, grid: Grid, candidates: ContactCandidates, state: ClothState, s: Surface, dt: float, substep: int
 ) -> DirectorForces:
     """Split the directors' stress into what acts on the surface columns (through n) and on d3 itself.
+
+    ``substep`` decides where the grid lies.
 
     The collision's damping uses the rate of closing from the substep before. Divided as if it were implicit, it is
     stable however hard layers are pressed.
@@ -149,9 +146,7 @@ def compute_director_forces(
     closing = state.memory["contact"].reshape(-1, points_per_triangle, 1).index_select(0, candidates.active)
     pressure = dot(by_director, normal).clamp(max=0)
     density = _select_active(candidates, model.areal_density, s.n).unsqueeze(-2)
-    implicit = (
-        1 - (2 * dt * grid.damping / (APPROACH_PER_COMPRESSION_SPACINGS * grid.spacing) ** 2) * pressure / density
-    )
+    implicit = 1 - (2 * dt * grid.damping * (COMPRESSION_PER_SPACING / grid.spacing) ** 2) * pressure / density
     damping = pressure * (grid.damping * closing / implicit).clamp(min=-1)
     by_normal, by_director = by_normal + damping * d3, by_director + damping * normal
 
@@ -162,9 +157,8 @@ def compute_director_forces(
         _select_active(candidates, model.areal_density * s.area, s.n) / points_per_triangle, points_per_triangle
     )
     position = _at_points(grid, candidates, state.x)
-    nodes = place_on_grid(
-        position, mass, _repeat_for_points(candidates.scene, points_per_triangle), grid, candidates.node_scratch
-    )
+    scene = _repeat_for_points(candidates.scene, points_per_triangle)
+    nodes = place_on_grid(position, mass, scene, grid, candidates.node_scratch, grid.shift(substep))
     return DirectorForces(
         cross(f2, reaction), cross(reaction, f1), energy_by_d3.flatten(0, 1), d3.flatten(0, 1), mass, nodes
     )

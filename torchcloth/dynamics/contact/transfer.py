@@ -32,7 +32,9 @@ class Stencil(NamedTuple):
     inverse_mass: Tensor
 
 
-def place_on_grid(position: Tensor, mass: Tensor, scene: Tensor, grid: Grid, node_scratch: Tensor) -> Stencil:
+def place_on_grid(
+    position: Tensor, mass: Tensor, scene: Tensor, grid: Grid, node_scratch: Tensor, shift: Tensor
+) -> Stencil:
     """Find the nodes around points, their weights and their masses.
 
     Args:
@@ -41,8 +43,9 @@ def place_on_grid(position: Tensor, mass: Tensor, scene: Tensor, grid: Grid, nod
         scene: [P] int64; points of different scenes do not interact.
         grid: spacing and size of the grid.
         node_scratch: int32 work memory, one entry per node and scene; overwritten.
+        shift: [3] in grid spacings, by which the points lie farther along the grid's axes.
     """
-    scaled = position / grid.spacing
+    scaled = position / grid.spacing + shift.to(position)
     base = torch.floor(scaled.detach() - 0.5)
     offset = scaled - base  # in [0.5, 1.5)
     weight, weight_gradient = _splines(offset, grid.spacing)

@@ -37,6 +37,7 @@ struct ContactSearch : Stage<R> {
     const Program<R>& program;
     LayerSearch<R> search;
     int x, lowest_node;     // fields: positions, lowest node of each point
+    int shift;              // field: where the grid lies, in spacings
     std::vector<int> grid;  // fields of the nodes, first the two that are added to, and of the points
     std::vector<R> place;   // [points of a triangle, 3] barycentric
     int search_interval;    // substeps after which the search is repeated in any case
@@ -74,7 +75,7 @@ struct ContactSearch : Stage<R> {
             s.parts = program.parts(s);
             s.point_parts = state.points.size() * OPS_PER_POINT >= s.min_ops_per_thread ? s.parts : 1;
         }
-        state.nodes.update(state.points, s.value[x], program.fields[x].rows, spacing, changed, s.point_parts, s.team);
+        state.nodes.update(state.points, s.value[x], spacing, s.value[shift], changed, s.point_parts, s.team);
         export_tables(s, state);
         reserve_fields(s, state);
     }

@@ -121,8 +121,8 @@ struct Engine {
         auto& program = static_cast<Engine<R>*>(e)->program;                                                           \
         return guarded([&] {                                                                                           \
             auto contact = std::make_unique<tc::ContactSearch<R>>(program);                                            \
-            contact->x = fields[0], contact->lowest_node = fields[1],                                                  \
-            contact->grid.assign(fields + 2, fields + count);                                                          \
+            contact->x = fields[0], contact->lowest_node = fields[1], contact->shift = fields[2],                      \
+            contact->grid.assign(fields + 3, fields + count);                                                          \
             contact->spacing = R(lengths[0]), contact->skin = R(lengths[1]), contact->search_interval = limits[0];     \
             contact->place.assign(places, places + 3 * each);                                                          \
             if (limits[2] != tc::PATCH_TRIANGLES) throw std::logic_error("patches of another size");                   \

@@ -168,9 +168,9 @@ struct Program {
     mutable std::mutex policy_mutex;
 
     int field(FieldKind kind, int rows, int comps, int neighbours = 0, int vertices = 0) {
-        const bool is_weight = neighbours > 0, is_plain = is_weight || kind == FieldKind::per_substep;
-        fields.push_back({kind, rows, comps, is_plain ? rows : round_up(rows, LANES<float>),
-                          is_plain ? comps : pitch_of(comps), -1, is_weight, neighbours, vertices});
+        const bool is_weight = neighbours > 0, has_one_row = kind == FieldKind::per_substep;
+        fields.push_back({kind, rows, comps, is_weight || has_one_row ? rows : round_up(rows, LANES<float>),
+                          is_weight ? comps : pitch_of(comps), -1, is_weight, neighbours, vertices});
         next.push_back(-1);
         constants.emplace_back();
         return int(fields.size()) - 1;

@@ -233,7 +233,7 @@ class Run {
     static bool is_input(FieldKind kind) { return kind == FieldKind::parameter || kind == FieldKind::per_substep; }
     static bool is_within(FieldKind kind) { return kind == FieldKind::temporary || kind == FieldKind::recorded; }
     size_t size_of(const Field& f) const {
-        return f.kind == FieldKind::per_substep ? size_t(call.substeps) * f.comps : f.size();
+        return f.kind == FieldKind::per_substep ? size_t(call.substeps) * f.pitch : f.size();
     }
 
     // Memory of one of so many tasks, with tangents along so many directions.
@@ -381,7 +381,7 @@ class Run {
             if (field.kind == FieldKind::state || field.kind == FieldKind::recorded) m.scene.value[f] = row + place;
             if (program.next[f] >= 0) m.scene.value[program.next[f]] = after + place;
             if (field.kind == FieldKind::per_substep) {
-                const size_t first = size_t(k) * field.comps * m.scene.lanes;
+                const size_t first = size_t(k) * field.pitch * m.scene.lanes;
                 m.scene.value[f] = m.values[f].data + first;
                 if (m.bars[f].data) m.scene.bar[f] = m.bars[f].data + first;
                 if (m.dots[f].data) m.scene.dot[f] = m.dots[f].data + first * m.scene.directions;

@@ -42,9 +42,9 @@ struct SparseGrid {
 
     void start(size_t points) { lowest_node.reset(size_t(round_up(int(points), L)) / L * 3); }
 
-    // Updates the blocks of all points. Points move from cell to cell seldom: only those that did are looked up, and
-    // only packs that may have such points are checked.
-    void update(const ContactPoints<R>& points, const R* x, int vertices, R spacing, bool all_new, int parts,
+    // Updates the blocks of all points, on a grid that lies elsewhere in every substep. Points whose cell has changed
+    // are looked up.
+    void update(const ContactPoints<R>& points, const R* x, R spacing, const R* shift, bool all_new, int parts,
                 ThreadTeam* team) {
         const int size = points.size(), packs = (size + L - 1) / L;
         if (size == 0) return;
@@ -52,12 +52,9 @@ struct SparseGrid {
             reset(size, parts);
             all_new = true;
         }
-        total_displacement += 1.0001 * largest_displacement(x, vertices);
         auto check = [&](int part) {
-            for (int pack = begin_of(part, parts, packs); pack < begin_of(part + 1, parts, packs); pack++) {
-                const bool may_move = all_new || total_displacement >= next_check[pack];
-                moved_lanes[pack] = may_move ? find_moved(points, pack, x, spacing, all_new) : 0;
-            }
+            for (int pack = begin_of(part, parts, packs); pack < begin_of(part + 1, parts, packs); pack++)
+                moved_lanes[pack] = find_moved(points, pack, x, spacing, shift, all_new);
         };
         if (parts == 1) check(0);
         else team->run(parts, check);
@@ -80,28 +77,14 @@ struct SparseGrid {
     std::vector<int> part_of;         // by block
     std::vector<int> part_begins;     // by part
     int blocks_after_reset = 0;       // count of blocks when all points were last looked up
-    Buffer<R> last_positions;         // of the vertices, at the last call
-    double total_displacement = 0;    // bound on the path length of every vertex
-    std::vector<double> next_check;   // by pack: total displacement at which a point may have other nodes
     std::vector<unsigned> moved_lanes;  // by pack: a bit for each point that has other nodes
 
-    // The largest displacement of a vertex since the last call, along one of the axes. No point moves farther.
-    R largest_displacement(const R* x, int vertices) {
-        const size_t size = size_t(vertices) * VERTEX_PITCH;
-        if (last_positions.size != size) last_positions.reset(size);
-        const Quad<R>* now = reinterpret_cast<const Quad<R>*>(x);
-        Quad<R>*last = reinterpret_cast<Quad<R>*>(last_positions.data), largest(0.0);
-        for (int v = 0; v < vertices; v++) {
-            const Quad<R> step = abs(now[v] - last[v]);
-            largest = select(less(largest, step), step, largest), last[v] = now[v];
-        }
-        return std::max(largest[0], std::max(largest[1], largest[2]));
-    }
     // A bit for each point of a pack whose nodes have changed; stores the points' lowest nodes.
-    unsigned find_moved(const ContactPoints<R>& points, int pack, const R* x, R spacing, bool all_new) {
+    unsigned find_moved(const ContactPoints<R>& points, int pack, const R* x, R spacing, const R* shift,
+                        bool all_new) {
         const int lanes = std::min(L, points.size() - pack * L);
         P low[3], *before = lowest_node.data + 3 * pack, same(1.0);
-        next_check[pack] = total_displacement + locate(points, pack * L, x, spacing, low);
+        locate(points, pack * L, x, spacing, shift, low);
         for (int d = 0; d < 3; d++) same = same * (1.0 - abs(less(low[d], before[d]) + less(before[d], low[d])));
         if (!all_new && total(same) == L) return 0;
         unsigned moved = 0;
@@ -110,10 +93,9 @@ struct SparseGrid {
         return moved;
     }
     // Computes where the blocks of a pack's points begin: at the lowest node along x and y, along z at an even one.
-    // Returns the distance of all points from where that changes, less a margin for rounding.
-    static R locate(const ContactPoints<R>& points, int first, const R* x, R spacing, P* low) {
+    static void locate(const ContactPoints<R>& points, int first, const R* x, R spacing, const R* shift, P* low) {
         const int last = points.size() - 1;
-        P at[3] = {P(0.0), P(0.0), P(0.0)}, margin(1.0);
+        P at[3] = {P(0.0), P(0.0), P(0.0)};
         for (int c = 0; c < 3; c++) {
             P corner[4];
             const int* vertex = points.corner[c].data();
@@ -124,18 +106,10 @@ struct SparseGrid {
             for (int d = 0; d < 3; d++) at[d] = at[d] + points.weight[first / L * 3 + c] * corner[d];
         }
         for (int d = 0; d < 3; d++) {
-            const double width = d == 2 ? 2 : 1;
-            for (int lane = 0; lane < L; lane++) {
-                at[d].v[lane] = at[d].v[lane] / spacing - R(0.5);
-                low[d].v[lane] = R(width) * std::floor(at[d].v[lane] / R(width));
-            }
-            const P below = at[d] - low[d], above = width - below;
-            margin = select(less(below, margin), below, margin);
-            margin = select(less(above, margin), above, margin);
+            const R width = d == 2 ? 2 : 1;
+            for (int lane = 0; lane < L; lane++)
+                low[d].v[lane] = width * std::floor((at[d].v[lane] / spacing + shift[d] - R(0.5)) / width);
         }
-        R smallest = 1;
-        for (int lane = 0; lane < L && first + lane <= last; lane++) smallest = std::min(smallest, margin[lane]);
-        return (smallest - R(1e-4)) * spacing;
     }
     void reset(int points, int parts) {
         part_begins.assign(parts, 0);
@@ -143,7 +117,6 @@ struct SparseGrid {
         blocks_of_point.assign(size_t(points) * BLOCKS_PER_POINT, 0);
         key.assign(1024, -1), block_number.assign(1024, 0);
         block_above.assign(1, 0), next_copy.assign(1, 0), part_of.assign(1, 0), is_lowest.assign(1, false);
-        next_check.assign(size_t(points + L - 1) / L, 0);
     }
     void insert_blocks(int64_t x, int64_t y, int64_t z, int part, int* out) {
         for (int64_t i = 0; i < 3; i++)

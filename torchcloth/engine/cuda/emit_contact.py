@@ -259,7 +259,7 @@ class ContactSearchEmitter:
         yield "    Count low[3];"
         yield "    for (int d = 0; d < 3; d++) {"
         at = _at_corners("PLACES[p % EACH][{k}] * {}")
-        yield f"        const R place = floor(({at}) / R({s.spacing!r}) - R(0.5));"
+        yield f"        const R place = floor(({at}) / R({s.spacing!r}) + h.f{s.shift}[d] - R(0.5));"
         yield f"        h.f{s.lowest_node}[3 * p + d] = place, low[d] = Count(place);"
         yield "    }"
         yield "    const int home = insert(n, key_of(low[0], low[1], low[2]));"

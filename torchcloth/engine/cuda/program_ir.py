@@ -151,6 +151,7 @@ class ContactSearch(NamedTuple):
     Attributes:
         x: field of the positions.
         lowest_node: field of each point's lowest node.
+        shift: field of where the grid lies [spacings].
         fields: fields of nodes and points.
         corners: [3, E] vertices.
         barycentric: [S, 3] barycentric coordinates of a triangle's points.
@@ -161,6 +162,7 @@ class ContactSearch(NamedTuple):
 
     x: int
     lowest_node: int
+    shift: int
     fields: tuple[int, ...]
     corners: np.ndarray
     barycentric: np.ndarray
@@ -292,7 +294,7 @@ def _contact_search(
             members = order[patch_starts[patch] : patch_starts[patch + 1]]
             matrix[np.ix_(order, members)] = bits[:, patch, : len(members)]
     return ContactSearch(
-        fields[0], fields[1], fields[2:], corners, barycentric, spacing, search_skin, reach, search_interval, matrix
+        *fields[:3], fields[3:], corners, barycentric, spacing, search_skin, reach, search_interval, matrix
     )
 
 

@@ -10,7 +10,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from ...dynamics.contact import APPROACH_PER_COMPRESSION_SPACINGS, Grid
+from ...dynamics.contact import COMPRESSION_PER_SPACING, Grid
 from ...dynamics.contact.self_contact import SUBSTEPS_PER_CHECKPOINT
 from ..builder import DIRECTORS, SubstepBuilder, UnsupportedPart, lowering_of
 from ..enums import CONTACT_ROWS, ContactCount, ContactTable, TransferBasis
@@ -41,11 +41,12 @@ class ContactLowering:
         self.mass, self.momentum, self.change, self.velocity = self.nodes = [program.nodes() for _ in range(4)]
         self.points = [program.points(comps) for comps in (16, 3, 1)]  # surface, offset, mass
         self.lowest_node = program.points(3)
+        self.shift = builder.grid_shift = program.per_substep(3)
         self.lengths = program.constant(torch.tensor([[grid.spacing, 1 / grid.spacing]], dtype=torch.float64))
         self.area_share = builder.number(1 / len(grid.points))
         self.min_mass_kg = torch.finfo(program.dtype).tiny ** 0.5
         self.clearance = builder.number(grid.free_compression)
-        slowing = 2 * grid.damping / (APPROACH_PER_COMPRESSION_SPACINGS * grid.spacing) ** 2
+        slowing = 2 * grid.damping * (COMPRESSION_PER_SPACING / grid.spacing) ** 2
         self.damping = program.constant(torch.tensor([[grid.damping, slowing]], dtype=torch.float64))
         self.barycentric = program.constant(grid.points)
         self.area = program.constant(model.geometry.area)
@@ -119,7 +120,7 @@ class ContactLowering:
         grid, corners = self.grid, self.builder.model.geometry.corners.view(3, -1)
         patches = patches_of(grid, corners)
         return ContactSearch(
-            fields=[self.builder.x.start, self.lowest_node, *self.nodes, *self.points],
+            fields=[self.builder.x.start, self.lowest_node, self.shift, *self.nodes, *self.points],
             corners=corners.cpu().numpy().astype("int32"),
             barycentric=grid.points.cpu().double().numpy(),
             lengths=(grid.spacing, grid.search_skin, grid.reach),
@@ -153,7 +154,7 @@ class _PointLoop:
         lowest = self.loop.load(self._contact.lowest_node)
         values = [
             self.loop.call("surface", *corners, self.shape),
-            self.loop.call("grid_offset", self.lengths, lowest, self.place, *corners),
+            self.loop.call("grid_offset", self.lengths, self.loop.load(self._contact.shift), lowest, self.place, *corners),
             self.loop.call("point_mass", density, self.area, self.area_share),
         ]
         for regs, field in zip(values, self._contact.points, strict=True):

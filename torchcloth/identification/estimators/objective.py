@@ -17,7 +17,16 @@ from ...episodes.cloth_fingerprint import cloth_fingerprint_parts
 from ...episodes.grip_patch_mesh import GrippedCloths, StretchedCloth
 from ...episodes.observed import Episode
 from ...episodes.observed_surface import build_surface
-from ...episodes.replay import Frames, StateModes, map_frames, see_at, simulate, simulate_all, simulate_with_tangents
+from ...episodes.replay import (
+    Frames,
+    StateModes,
+    map_frames,
+    see_at,
+    shared_step,
+    simulate,
+    simulate_all,
+    simulate_with_tangents,
+)
 from ...episodes.unknowns import Unknown
 from ...errors import InvalidInput, SimulationDiverged, UnstableStep
 from ...parameters import PhysicalParameter
@@ -297,12 +306,12 @@ class Objective:
         Returns:
             For each fabric the frames of all episodes; None where a simulation fails.
         """
-        by_episode = [self._simulate_fabrics(raw, fabrics, i) for i in range(len(self.episodes))]
+        by_episode = [self._simulate_fabrics(raw, fabrics, i, self.dt) for i in range(len(self.episodes))]
         return [None if None in frames else list(frames) for frames in zip(*by_episode, strict=True)]
 
-    def _simulate_fabrics(self, raw: Tensor, fabrics: Tensor, i: int) -> list[Frames | None]:
+    def _simulate_fabrics(self, raw: Tensor, fabrics: Tensor, i: int, dt: float | None) -> list[Frames | None]:
         cloth, episode, view = self._gripped_episode(raw, i)
-        simulated = simulate_all(cloth, self.unknowns, fabrics, episode, self.dt)
+        simulated = simulate_all(cloth, self.unknowns, fabrics, episode, dt)
         return [None if frames is None else view(frames) for frames in simulated]
 
     def _gripped_episode(self, raw: Tensor, i: int) -> tuple[Cloth, Episode, Callable[[Frames], Frames]]:
@@ -406,14 +415,31 @@ class Objective:
     def _replace_by_differences(
         self, raw: Tensor, i: int, frames: Frames, derivatives: Frames, steps: Mapping[int, float]
     ) -> None:
-        """Write finite slopes by some unknowns into derivatives [K, ...] of episode ``i``."""
-        for k, (step, there) in self._simulate_shifted(raw, i, steps).items():
+        """Write finite slopes by some unknowns into derivatives [K, ...] of episode ``i``.
+
+        With contact all simulations have the same substep. The grid lies elsewhere at every substep, so that another
+        count of substeps changes the forces a little.
+        """
+        dt = self.dt
+        if dt is None and self.cloth.contact is not None:
+            dt = self._shared_step(raw, steps)
+            frames = self._simulate_fabrics(raw, raw.detach()[None, : len(self.unknowns)], i, dt)[0] or frames
+        for k, (step, there) in self._simulate_shifted(raw, i, steps, dt).items():
             derivatives.x[k], derivatives.v[k] = (there.x - frames.x) / step, (there.v - frames.v) / step
             for name, wrench in derivatives.wrench.items():
                 wrench[k] = (there.wrench[name] - frames.wrench[name]) / step
 
+    def _shared_step(self, raw: Tensor, sizes: Mapping[int, float]) -> float | None:
+        """Return a substep [s] that is stable at a point and at steps of its unknowns, by index, in both directions."""
+        fabric = raw.detach()[: len(self.unknowns)]
+        shifts = [d * torch.eye(len(fabric))[k].to(raw) for k, d in sizes.items() if k < len(fabric)]
+        around = [fabric + sign * shift for shift in shifts for sign in (1, -1)]
+        return shared_step(self.cloth, self.unknowns, torch.stack([fabric, *around]))
+
     @torch.no_grad()
-    def _simulate_shifted(self, raw: Tensor, i: int, sizes: Mapping[int, float]) -> dict[int, tuple[float, Frames]]:
+    def _simulate_shifted(
+        self, raw: Tensor, i: int, sizes: Mapping[int, float], dt: float | None
+    ) -> dict[int, tuple[float, Frames]]:
         """Simulate one step of each of some unknowns, by index, backwards where forwards fails.
 
         Returns:
@@ -426,7 +452,7 @@ class Objective:
             legal = {k: point for k, point in shifted.items() if torch.equal(self.clip(point), point)}
             fabrics = [k for k in legal if k < len(self.unknowns)]
             points = torch.stack([raw, *(legal[k] for k in fabrics)])[1:, : len(self.unknowns)]
-            simulated = dict(zip(fabrics, self._simulate_fabrics(raw, points, i), strict=True))
+            simulated = dict(zip(fabrics, self._simulate_fabrics(raw, points, i, dt), strict=True))
             for k in legal.keys() - set(fabrics):
                 with suppress(SimulationDiverged, UnstableStep):
                     simulated[k] = self._simulate_cloth(legal[k], i)

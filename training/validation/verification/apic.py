@@ -105,7 +105,7 @@ def step(
     memory = update_memory(model, state, s, dt, compensation)
     if contact_candidates is None:
         contact_candidates = find_contact_candidates(model, grid, state.x)
-    director_forces = compute_director_forces(model, grid, contact_candidates, state, s, dt)
+    director_forces = compute_director_forces(model, grid, contact_candidates, state, s, dt, substep)
     stress = add_director_stress(contact_candidates, membrane_stress(model, s, memory), director_forces)
 
     # weight and air drag act on triangles, too: they change velocities before the grid. Air has no added mass here
@@ -123,7 +123,7 @@ def step(
     mass = _particle_masses(model, state, s).reshape(-1, 1)
     particles = position.shape[0] // max(1, batch.numel())  # of one scene
     scene = torch.arange(batch.numel(), device=position.device).repeat_interleave(particles)
-    nodes = place_on_grid(position, mass, scene, grid, contact_candidates.node_scratch)
+    nodes = place_on_grid(position, mass, scene, grid, contact_candidates.node_scratch, grid.shift(substep))
 
     affine = memory[MEMORY_NAME].reshape(-1, 3, 3)
     momentum = affine_momentum(nodes, mass, velocity, affine, grid.spacing)

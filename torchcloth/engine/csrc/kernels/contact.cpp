@@ -56,18 +56,19 @@ struct ContactPressure {
 };
 TC_KERNEL(ContactPressure)
 
-// Offset of a point from its lowest node in spacings, from spacing and its inverse, lowest node, place and corners.
+// Offset of a point from its lowest node in spacings, from spacing and its inverse, shift of the grid, lowest node,
+// place and corners.
 struct GridOffset {
     static constexpr const char* name = "grid_offset";
-    static constexpr int inputs = 17, outputs = 3;
-    static constexpr auto constant_inputs = input_bits(0, 8);
+    static constexpr int inputs = 20, outputs = 3;
+    static constexpr auto constant_inputs = input_bits(0, 11);
     template <class T>
     static constexpr void run(const T* in, T* out) {
         Reader<T> r{in};
         r.number();
         const T inverse = r.number();
-        const auto lowest = r.vec(), place = r.vec(), a = r.vec(), b = r.vec(), c = r.vec();
-        Writer<T>{out}.vec(inverse * at_point(place, a, b, c) - lowest);
+        const auto shift = r.vec(), lowest = r.vec(), place = r.vec(), a = r.vec(), b = r.vec(), c = r.vec();
+        Writer<T>{out}.vec(inverse * at_point(place, a, b, c) + (shift - lowest));
     }
 };
 TC_KERNEL(GridOffset)
