@@ -154,9 +154,8 @@ def test_a_node_that_hardly_weighs_has_finite_derivatives(corner):
     grid = tc.Contact(spacing=0.01).build_grid(tc.meshes.rectangle(0.1, 0.1, resolution=(5, 5)))
     place = (0.01 * torch.full((1, 3), corner)).requires_grad_()
     mass = torch.tensor([[1e-6]], requires_grad=True)
-    nodes = place_on_grid(
-        place, mass, torch.zeros(1, dtype=torch.int64), grid, torch.zeros(grid.nodes**3, dtype=torch.int32)
-    )
+    scene, node_scratch = torch.zeros(1, dtype=torch.int64), torch.zeros(grid.nodes**3, dtype=torch.int32)
+    nodes = place_on_grid(place, mass, scene, grid, node_scratch, torch.zeros(3))
     change, moment = transfer_director_forces(nodes, torch.ones(1, 3), torch.ones(1, 3), grid.spacing, 1e-4)
     (change.sum() + moment.sum()).backward()
     assert torch.isfinite(place.grad).all()

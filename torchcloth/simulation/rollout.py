@@ -279,9 +279,7 @@ def advance_interval(
     if interval.fused is None:
         state, compensation, total = _run_reference(interval, state, compensation, prescribed, checkpoint)
     else:
-        run = partial(
-            interval.fused.rollout_segment, checkpoint=checkpoint, first_substep=interval.first_substep
-        )
+        run = partial(interval.fused.rollout_segment, checkpoint=checkpoint, first_substep=interval.first_substep)
         state, compensation, total = run(state, compensation, interval.dt, prescribed, interval.count)
     check_finite(interval, start, state)
     return state, compensation, total

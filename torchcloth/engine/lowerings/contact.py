@@ -154,7 +154,9 @@ class _PointLoop:
         lowest = self.loop.load(self._contact.lowest_node)
         values = [
             self.loop.call("surface", *corners, self.shape),
-            self.loop.call("grid_offset", self.lengths, self.loop.load(self._contact.shift), lowest, self.place, *corners),
+            self.loop.call(
+                "grid_offset", self.lengths, self.loop.load(self._contact.shift), lowest, self.place, *corners
+            ),
             self.loop.call("point_mass", density, self.area, self.area_share),
         ]
         for regs, field in zip(values, self._contact.points, strict=True):

@@ -5,20 +5,24 @@ from __future__ import annotations
 import math
 from typing import Any
 
+import numpy as np
 import torch
+from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 import torchcloth as tc
 from torchcloth._utils.constants import STANDARD_GRAVITY_M_PER_S2
+from torchcloth.dynamics.contact import compression_at, layer_pressure
 
 from . import closed_forms
 from .case_figures import MEASURED_COLOUR, SECOND_COLOUR
-from .registry import AT_LEAST_TRUTH, AT_MOST_TRUTH, FigureData, Outcome, Row, absolute, register_case
+from .registry import AT_LEAST_TRUTH, AT_MOST_TRUTH, FigureData, Outcome, Row, absolute, register_case, relative
 from .scenes import indices_where, smooth_step, stack_sheets, stationary_trajectory, translation_trajectory
 
 # k h = 75 N/m lets a 3 mm grid step by about 0.1 ms: dt ~ spacing sqrt(rho_A / (k h))
 LAYER_STIFFNESS_N_PER_M, CONTACT_STIFFNESS_N_PER_M, SHEAR_STIFFNESS_N_PER_M = 150.0, 75.0, 20.0
 LAYER_DENSITY_KG_PER_M2, LAYER_THICKNESS_M = 0.2, 1e-3
+FAR_GAP_SPACINGS = 2.6  # at which layers begin that are pressed together
 
 
 def make_material(cone: float = 0.3) -> tc.materials.AEP:
@@ -71,6 +75,87 @@ def simulate_drop(spacing: float, speed: float, duration: float) -> tuple[tc.Rol
         )
         rest = cloth.settle(out.state, {"pin": stationary_trajectory()}, duration=0.25, rate=40.0)
     return out, rest, count
+
+
+def press_layers(gap: float, place: np.ndarray, turn: Rotation) -> tuple[float, float]:
+    """Return the mean compression of the directors, and the pressure over k h / spacing, of held layers at a gap.
+
+    Args:
+        gap: at the end [grid spacings]. Layers come from beyond each other's reach.
+        place: [3] of the lower layer in the grid [grid spacings].
+        turn: of both layers in the grid.
+    """
+    size, spacing = 0.05, 5e-3
+    sheet = tc.meshes.rectangle(size, size, resolution=(9, 9))
+    mesh = stack_sheets(sheet, sheet, (0.0, 0.0, FAR_GAP_SPACINGS * spacing))
+    mesh = tc.meshes.Mesh.build(turn.apply(mesh.vertices) + spacing * place, mesh.faces, mesh.uv)
+    count, normal = len(sheet.vertices), torch.as_tensor(turn.apply([0.0, 0.0, 1.0]))
+    grasps = {"low": tc.boundaries.Grasp(range(count)), "high": tc.boundaries.Grasp(range(count, 2 * count))}
+    contact = tc.Contact(spacing=spacing, damping=0.0)
+    cloth = tc.Cloth(mesh, make_material(), LAYER_DENSITY_KG_PER_M2, boundaries=grasps, contact=contact)
+    t = torch.linspace(0, 0.04, 17)
+    approach = (FAR_GAP_SPACINGS - gap) * spacing * smooth_step(t / 0.02)
+    motion = {"low": stationary_trajectory(), "high": translation_trajectory(t, -approach[:, None] * normal)}
+    with torch.no_grad():
+        out = cloth(cloth.rest_state(), motion, times=[0.0, 0.03, 0.04])
+    pressure = float(out.wrench["high"][-1, :3] @ normal) / size**2
+    return 1 - float((out.state.d3 @ normal).abs().mean()), pressure * spacing / CONTACT_STIFFNESS_N_PER_M
+
+
+def draw_press(figure: Any, data: FigureData) -> None:
+    """Draw the pressure between layers over their distance."""
+    axis = figure.subplots()
+    axis.plot(data["gap"], data["closed"], color="k", lw=1, label="closed form")
+    axis.plot(data["flat_gap"], data["flat"], "o", ms=4, color=MEASURED_COLOUR, label="along the grid, any place")
+    axis.plot(data["turned_gap"], data["turned"], "x", ms=5, color=SECOND_COLOUR, label="turned, any place")
+    axis.set(xlabel="distance of the layers [grid spacings]", ylabel="pressure · spacing / (k h)")
+    axis.legend()
+
+
+@register_case(
+    "press-of-layers",
+    "Layers pressed together at any place and in any attitude in the grid",
+    truth="closed form: mean over all places of the grid",
+    draw=draw_press,
+)
+def press_of_layers(fast: bool) -> Outcome:
+    """Press held layers at random places and attitudes, and compare with the closed form."""
+    rng, places = np.random.default_rng(0), 2 if fast else 4
+    gaps = np.repeat([0.6, 0.8, 1.0, 1.2], places)
+    free = tc.Contact().free_compression
+    data = {"gap": np.linspace(0.4, 2.0, 81)}
+    data["closed"] = layer_pressure(data["gap"], free)
+    expected, rows = layer_pressure(gaps, free), []
+    for name, label, tolerance in (("flat", "along the grid", 0.05), ("turned", "turned", 0.12)):
+        measured = []
+        for gap in gaps:
+            turn = Rotation.random(random_state=rng) if name == "turned" else Rotation.identity()
+            measured.append(press_layers(gap, rng.uniform(size=3), turn))
+        compression, pressure = np.array(measured).T
+        off = np.abs(compression - compression_at(torch.as_tensor(gaps)).numpy()).max()
+        rows.append(Row(f"largest error of the compression, {label}", float(off), 0.0, "", absolute(0.01)))
+        ratio = pressure / expected
+        rows.append(
+            Row(
+                f"smallest pressure over that of the closed form, {label}",
+                float(ratio.min()),
+                1.0,
+                "",
+                relative(tolerance),
+            )
+        )
+        rows.append(
+            Row(
+                f"largest pressure over that of the closed form, {label}",
+                float(ratio.max()),
+                1.0,
+                "",
+                relative(tolerance),
+            )
+        )
+        data |= {name: pressure, f"{name}_gap": gaps}
+    note = f"{len(gaps)} places each, at gaps of 0.6 to 1.2 spacings. The grid lies elsewhere in every substep."
+    return Outcome(rows, data, note)
 
 
 def draw_drop(figure: Any, data: FigureData) -> None:
