@@ -144,6 +144,8 @@ JSON = [
     (("cloth", "areal_density"), 10**400, "cloth.areal_density is not a finite number"),
     (("cloth", "areal_density_std"), -1, "cloth.areal_density_std is too small"),
     (("cloth", "thickness"), 0.5, "cloth.thickness looks like millimetres"),
+    (("cloth", "layer_gap"), 10, "cloth.layer_gap looks like millimetres; got 10"),
+    (("cloth", "layer_gap"), 0.0, "cloth.layer_gap is too small; got 0.0; expected more than 0"),
     (("cloth", "sheet"), {"width": 300, "height": 200}, "cloth.sheet.width looks like millimetres; got 300"),
     (("cloth", "sheet"), {"width": 0.3, "height": 0.3}, "cloth.sheet is not the mesh; got a mesh of"),
     (("cloth", "sheet", "height"), DROP, "cloth.sheet.height is missing"),

@@ -127,6 +127,7 @@ def test_the_format_texts_example_is_read(tmp_path):
             "areal_density": 0.15,
             "thickness": 0.0005,
             "areal_density_std": 0.005,
+            "layer_gap": 0.01,
             "initial_vertices": None,
             "nominal": {"membrane_stiffness": 600, "units": {}},
         },
@@ -148,6 +149,7 @@ def test_the_format_texts_example_is_read(tmp_path):
     got = rec.read(tmp_path)
     assert got.joints["left"].q.shape == (5, 7)
     assert got.cloth.sheet == (0.3, 0.3)
+    assert rec.read(rec.write(got, tmp_path / "again")).cloth.layer_gap == 0.01
     assert got.split == {"motion": "slow_swing"}
 
 

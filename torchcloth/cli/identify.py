@@ -122,7 +122,7 @@ def _add_options(parser: argparse.ArgumentParser) -> None:
         "--contact",
         type=float,
         metavar="SPACING",
-        help="spacing of the contact grid [m] (default: layers do not touch)",
+        help="spacing of the contact grid between layers [m] (default: as cloth.layer_gap of the episode says)",
     )
     parser.add_argument("--dt", type=float, metavar="SECONDS", help="largest substep (default: the stable one)")
     parser.add_argument(

@@ -25,6 +25,8 @@ from .pattern_interpolation import interpolate_on_pattern, interpolation_weights
 
 DEFAULT_MEMBRANE_STIFFNESS_N_PER_M = 300.0  # middle of the published fabrics, where an episode names none
 DEFAULT_POISSON_RATIO = 0.2
+DEFAULT_CONTACT_STIFFNESS_N_PER_M = 100.0  # k h; more shortens the stable step, and layers at rest hardly notice
+DEFAULT_LAYER_FRICTION = 0.3
 DEFAULT_SHEET_TRIANGLES = 288
 SAME_PATTERN_PLACE_M = 1e-6  # distance on the pattern within which two places are one
 
@@ -41,7 +43,7 @@ def build_cloth(
         recording: names mesh or sheet, density, grasps, colliders, gravity, air.
         material: None: A-EP at the episode's nominal values, or at a start in the middle of published fabrics.
         effects: None: gravity; bending where the episode has a nominal value; air drag where it states a density.
-        contact: between layers; None leaves it out.
+        contact: between layers; None: as the episode's ``layer_gap`` says, without which layers do not touch.
 
     Raises:
         RecordingError: the episode has neither mesh nor sheet.
@@ -69,7 +71,9 @@ def build_cloth(
     for name, grasp in recording.grasps.items():
         vertices = None if grasp.vertices is None else grasp.vertices.tolist()
         boundaries[name] = Grasp(vertices) if grasp.uv is None else Grasp(uv=grasp.uv, radius=grasp.radius)
-    density = recording.cloth.areal_density
+    density, gap = recording.cloth.areal_density, recording.cloth.layer_gap
+    if contact is None and gap is not None:
+        contact = Contact.with_gap(gap)
     return Cloth(mesh, material or build_material(recording), density, effects, boundaries, contact)
 
 
@@ -112,7 +116,16 @@ def build_material(recording: Recording) -> AEP:
     stiffness = _nominal_number(nominal, "membrane_stiffness", DEFAULT_MEMBRANE_STIFFNESS_N_PER_M)
     youngs_modulus = _nominal_number(nominal, "youngs_modulus", stiffness / thickness)
     poisson_ratio = _nominal_number(nominal, "poisson_ratio", DEFAULT_POISSON_RATIO)
-    return AEP(youngs_modulus, poisson_ratio, thickness=thickness)
+    if recording.cloth.layer_gap is None:
+        return AEP(youngs_modulus, poisson_ratio, thickness=thickness)
+    contact_stiffness = _nominal_number(nominal, "contact_stiffness", DEFAULT_CONTACT_STIFFNESS_N_PER_M / thickness)
+    shear_stiffness = _nominal_number(nominal, "shear_stiffness", contact_stiffness / 4)
+    between_layers = {
+        "contact_stiffness": contact_stiffness,
+        "shear_stiffness": shear_stiffness,
+        "cone": _nominal_number(nominal, "cone", DEFAULT_LAYER_FRICTION),
+    }
+    return AEP(youngs_modulus, poisson_ratio, thickness=thickness, **between_layers)
 
 
 def _nominal_number(nominal: Mapping[str, Any], key: str, default: float) -> float:

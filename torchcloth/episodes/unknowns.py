@@ -147,7 +147,7 @@ def collect_unknowns(
                 "parameter to fit",
                 got=repr(name),
                 expected="a parameter of the model",
-                remedy="it needs contact between layers (--contact; in a config model.contact)",
+                remedy="it needs contact between layers (cloth.layer_gap of the episode; in a config model.contact)",
             )
         unknowns.append(_make_unknown(cloth, name, paths[name]))
     if weighed and "areal_density" in paths and "areal_density" not in names:

@@ -81,6 +81,7 @@ _CLOTH_FACTS = {
     ),
     "areal density (kg/m^2)": lambda r: r.cloth.areal_density,
     "thickness (m)": lambda r: DEFAULT_THICKNESS_M if r.cloth.thickness is None else r.cloth.thickness,
+    "layer gap (m)": lambda r: r.cloth.layer_gap,
     "data sheet": lambda r: {name: value for name, value in sorted(r.cloth.nominal.items()) if name != "units"},
     "set of grasps": lambda r: sorted(r.grasps),
 }

@@ -19,6 +19,7 @@ from .initial_shape import check_initial_shape
 from .types import Camera, ClothInfo, Collider, GraspInfo, RobotInfo
 
 MAX_THICKNESS_M = 0.05
+MAX_LAYER_GAP_M = 0.2
 DEFAULT_THICKNESS_M = 1e-3  # if the episode gives none
 DEFAULT_TABLE_FRICTION = 0.4  # if the episode gives none
 MAX_GRASP_RADIUS_M = 1.0
@@ -30,6 +31,9 @@ NOMINAL_BOUNDS: dict[str, dict[str, Any]] = {  # bounds; far above every fabric,
     "poisson_ratio": {"above": 0, "maximum": 0.499999, "suspect": "another measure"},
     "bending_stiffness": {"minimum": 0, "maximum": 1.0, "suspect": "micronewton metres"},
     "bending_damping_time": {"minimum": 0, "maximum": 100.0, "suspect": "milliseconds"},
+    "contact_stiffness": {"above": 0, "maximum": 1e13, "suspect": "another unit"},
+    "shear_stiffness": {"above": 0, "maximum": 1e13, "suspect": "another unit"},
+    "cone": {"minimum": 0, "maximum": 100.0, "suspect": "an angle"},
 }
 UNSUPPORTED_COLLIDER_SHAPES = {"box", "capsule", "cylinder", "mesh", "sphere"}  # of colliders that are not built
 NOMINAL_UNITS_KEY = "units"  # of the data sheet, for people
@@ -71,6 +75,9 @@ def read_fabric(fields: Fields) -> dict[str, Any]:
         ),
         "thickness": fields.optional(
             fields.number, "thickness", above=0, maximum=MAX_THICKNESS_M, suspect="millimetres"
+        ),
+        "layer_gap": fields.optional(
+            fields.number, "layer_gap", above=0, maximum=MAX_LAYER_GAP_M, suspect="millimetres"
         ),
         "nominal": _nominal(fields.group("nominal")),
     }

@@ -26,6 +26,7 @@ class ClothInfo:
         areal_density: kg/m^2.
         areal_density_std: kg/m^2, one standard deviation.
         thickness: m.
+        layer_gap: m, from centre to centre of layers that rest on each other; None: layers do not touch.
         sheet: m, (width, height) of a rectangle with pattern corner (0, 0).
         vertices: [V, 3] m, rest mesh.
         faces: [F, 3] vertex indices.
@@ -41,6 +42,7 @@ class ClothInfo:
     areal_density: float
     areal_density_std: float | None = None
     thickness: float | None = None
+    layer_gap: float | None = None
     sheet: tuple[float, float] | None = None
     vertices: np.ndarray | None = None
     faces: np.ndarray | None = None

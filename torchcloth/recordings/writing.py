@@ -116,7 +116,7 @@ def _cloth(cloth: ClothInfo) -> dict[str, Any]:
         "initial_vertices": None if cloth.initial_vertices is None else INITIAL_VERTICES_FILE,
         "initial_velocities": None if cloth.initial_velocities is None else INITIAL_VELOCITIES_FILE,
     }
-    plain = ("areal_density", "areal_density_std", "thickness", "nominal")
+    plain = ("areal_density", "areal_density_std", "thickness", "layer_gap", "nominal")
     return _with(cloth.extra, **known, **{key: getattr(cloth, key) for key in plain})
 
 

@@ -24,6 +24,7 @@ def change_moduli(world: World, weft: float = 0.0, shear: float = 0.0, stiffenin
     """
     material = world.cloth.material
     nu, warp = float(material.poisson_ratio.value), float(material.youngs_modulus.value)  # type: ignore[union-attr,arg-type]
+    between_layers = {name: float(getattr(material, name).value) for name in material.contact_parameters}
     if isinstance(material, OrthotropicAEP):
         e2, g = float(material.weft_modulus.value), float(material.shear_modulus.value)
         c = float(material.warp_stiffening.value)
@@ -32,7 +33,8 @@ def change_moduli(world: World, weft: float = 0.0, shear: float = 0.0, stiffenin
         c = float(material.stiffening.value) if isinstance(material, StiffeningAEP) else 0.0
         if not (weft or shear):  # one modulus, which stays a parameter of fits
             thickness: float = material.thickness  # type: ignore[assignment]
-            return world.with_cloth(material=StiffeningAEP(warp, nu, stiffening=c + stiffening, thickness=thickness))
+            new = StiffeningAEP(warp, nu, stiffening=c + stiffening, thickness=thickness, **between_layers)
+            return world.with_cloth(material=new)
     e2, g, c = e2 * (1 - weft), g * (1 + shear), c + stiffening
     new = OrthotropicAEP(
         warp,
@@ -42,6 +44,7 @@ def change_moduli(world: World, weft: float = 0.0, shear: float = 0.0, stiffenin
         warp_stiffening=c,
         weft_stiffening=c,
         thickness=material.thickness,  # type: ignore[union-attr,arg-type]
+        **between_layers,
     )
     return world.with_cloth(material=new)
 

@@ -61,6 +61,7 @@ def save_model(
         "areal_density": cloth.areal_density,
         "areal_density_std": cloth.areal_density_std,
         "thickness": cloth.thickness,
+        "layer_gap": cloth.layer_gap,
         "sheet": None if cloth.sheet is None else list(cloth.sheet),
         "nominal": cloth.nominal,
         "gravity": recording.gravity.tolist(),
@@ -172,7 +173,7 @@ def adopt_data_sheet(path: str | Path, model_scene: Recording, scene: Recording)
             expected=f"{a.areal_density:.4g} kg/m^2",
             remedy="diagnose this cloth, or correct the episode's areal_density",
         )
-    sheet = ("areal_density", "areal_density_std", "thickness", "nominal")
+    sheet = ("areal_density", "areal_density_std", "thickness", "layer_gap", "nominal")
     return replace(scene, cloth=replace(b, **{name: getattr(a, name) for name in sheet}))
 
 

@@ -119,7 +119,7 @@ def draw_press(figure: Any, data: FigureData) -> None:
     draw=draw_press,
 )
 def press_of_layers(fast: bool) -> Outcome:
-    """Press held layers at random places and attitudes, and compare with the closed form."""
+    """Measure the pressure of held layers at random places and attitudes."""
     rng, places = np.random.default_rng(0), 2 if fast else 4
     gaps = np.repeat([0.6, 0.8, 1.0, 1.2], places)
     free = tc.Contact().free_compression
