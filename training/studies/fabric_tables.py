@@ -126,7 +126,7 @@ def _placement_note(result: Mapping[str, Any]) -> str:
     off = ", ".join(f"{symbol} is off by up to {format_percent(share)}" for symbol, share in worst.items())
     return (
         f"Layers that are pressed elsewhere in the contact grid, and turned, give nearly the same force: {off}. The "
-        "error bars of k and γ count 3 % for it.\n"
+        "error bars count 3 % for it.\n"
     )
 
 

@@ -431,10 +431,11 @@ class Objective:
 
     def _shared_step(self, raw: Tensor, sizes: Mapping[int, float]) -> float | None:
         """Return a substep [s] that is stable at a point and at steps of its unknowns, by index, in both directions."""
-        fabric = raw.detach()[: len(self.unknowns)]
-        shifts = [d * torch.eye(len(fabric))[k].to(raw) for k, d in sizes.items() if k < len(fabric)]
-        around = [fabric + sign * shift for shift in shifts for sign in (1, -1)]
-        return shared_step(self.cloth, self.unknowns, torch.stack([fabric, *around]))
+        points = [raw.detach()]
+        for k, size in sizes.items():
+            for step in (size, -size):
+                points.append(self.clip(raw.detach().index_add(0, torch.tensor(k), raw.new_tensor([step]))))
+        return shared_step(self.cloth, self.unknowns, torch.stack(points)[:, : len(self.unknowns)])
 
     @torch.no_grad()
     def _simulate_shifted(

@@ -16,7 +16,7 @@ from torch import Tensor
 
 from ...episodes.unknowns import Unknown
 
-CONTACT_STIFFNESSES = ("contact_stiffness", "shear_stiffness")  # k and gamma
+CONTACT_PARAMETERS = ("contact_stiffness", "shear_stiffness", "cone")
 
 
 @dataclass(frozen=True)
@@ -30,7 +30,7 @@ class ModelErrors:
         other: of all other parameters.
         grip_compliance: of parameters of the material, where it is unknown how far grippers hold the cloth. Corners
             that turn as hinges gave E h 0.72 to 0.80 of the truth (``studies strangers``, seeds 10 and 28).
-        contact: of k and gamma. Layers press by 3 % less or more in another attitude in the grid (``studies fabrics``,
+        contact: of k, gamma and c_F. Layers press by 3 % less or more in another attitude in the grid (``studies fabrics``,
             20 places and attitudes); so this error occurs in one simulator, too.
     """
 
@@ -42,7 +42,7 @@ class ModelErrors:
     def of(self, unknown: Unknown, has_unknown_grips: bool) -> float:
         """Return the relative standard deviation of a parameter."""
         error = self.bending if unknown.name.startswith("bending") else self.other
-        if unknown.name in CONTACT_STIFFNESSES:
+        if unknown.name in CONTACT_PARAMETERS:
             error = math.hypot(error, self.contact)
         is_material = unknown.key.startswith("material.")
         return math.hypot(error, self.grip_compliance) if has_unknown_grips and is_material else error
