@@ -119,13 +119,14 @@ def build_material(recording: Recording) -> AEP:
     if recording.cloth.layer_gap is None:
         return AEP(youngs_modulus, poisson_ratio, thickness=thickness)
     contact_stiffness = _nominal_number(nominal, "contact_stiffness", DEFAULT_CONTACT_STIFFNESS_N_PER_M / thickness)
-    shear_stiffness = _nominal_number(nominal, "shear_stiffness", contact_stiffness / 4)
-    between_layers = {
-        "contact_stiffness": contact_stiffness,
-        "shear_stiffness": shear_stiffness,
-        "cone": _nominal_number(nominal, "cone", DEFAULT_LAYER_FRICTION),
-    }
-    return AEP(youngs_modulus, poisson_ratio, thickness=thickness, **between_layers)
+    return AEP(
+        youngs_modulus,
+        poisson_ratio,
+        contact_stiffness=contact_stiffness,
+        shear_stiffness=_nominal_number(nominal, "shear_stiffness", contact_stiffness / 4),
+        cone=_nominal_number(nominal, "cone", DEFAULT_LAYER_FRICTION),
+        thickness=thickness,
+    )
 
 
 def _nominal_number(nominal: Mapping[str, Any], key: str, default: float) -> float:

@@ -92,7 +92,7 @@ def _contact_notes(result: Mapping[str, Any]) -> list[str]:
 
 def _pressed(result: Mapping[str, Any]):
     out = make_table(
-        f"Press, {result['presses']} trials a fabric, plates where the model has them; and turned, elsewhere in the grid",
+        f"Press, {result['presses']} trials a fabric, plates where the model has them, and elsewhere in the grid",
         "fabric",
         "",
         "truth",

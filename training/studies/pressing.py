@@ -62,7 +62,7 @@ class Plates(NamedTuple):
 
     def moved_randomly(self, rng: np.random.Generator) -> Plates:
         """Return plates at any place and in any attitude in the grid."""
-        turn = Rotation.random(random_state=rng).as_rotvec()
+        turn = Rotation.random(None, rng).as_rotvec()
         return self._replace(offset=tuple(rng.uniform(0, self.spacing, 3)), turn=tuple(turn))
 
 

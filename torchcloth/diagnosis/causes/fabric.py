@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from functools import partial
+from typing import Any
 
 from ...effects import Bending, CreasingBending, Gravity, LineMass, RestShape
 from ...episodes.world import Hypothesis, World
@@ -24,7 +25,9 @@ def change_moduli(world: World, weft: float = 0.0, shear: float = 0.0, stiffenin
     """
     material = world.cloth.material
     nu, warp = float(material.poisson_ratio.value), float(material.youngs_modulus.value)  # type: ignore[union-attr,arg-type]
-    between_layers = {name: float(getattr(material, name).value) for name in material.contact_parameters}
+    between_layers: dict[str, Any] = {
+        name: float(getattr(material, name).value) for name in material.contact_parameters
+    }
     if isinstance(material, OrthotropicAEP):
         e2, g = float(material.weft_modulus.value), float(material.shear_modulus.value)
         c = float(material.warp_stiffening.value)

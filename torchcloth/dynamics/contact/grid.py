@@ -139,10 +139,11 @@ class Grid(NamedTuple):
 class Contact:
     """Discretisation of the contact between layers of cloth, independent of the mesh.
 
-    Layers come to rest 1.4 grid spacings apart, wherever they lie in the grid, and under a hundred times a fabric's
-    weight 1.0 spacings apart (``compression.layer_pressure``); layers that start nearer stay nearer. Only triangles near another layer take part and cost time. Triangles
-    within about 10 spacings plus 3 edges along the cloth count as neighbours and do not interact: ``print(cloth)`` says
-    how far. A coarse cloth needs a finer mesh before its folds can touch.
+    Layers come to rest 1.4 grid spacings apart, wherever they lie in the grid. Under a hundred times a fabric's weight
+    they are 1.0 spacings apart (``compression.layer_pressure``). Layers that start nearer stay nearer. Only triangles
+    near another layer take part and cost time. Triangles within about 10 spacings plus 3 edges along the cloth count as
+    neighbours and do not interact: ``print(cloth)`` says how far. A coarse cloth needs a finer mesh before its folds
+    can touch.
 
     Cost: points per triangle grow with (edge / spacing)^2, so a small gap needs small triangles of even size, because
     all get as many points as the longest edges need. The stable step falls with spacing sqrt(areal density / (k h)), so

@@ -293,8 +293,9 @@ def _contact_search(
         for patch in range(patches):
             members = order[patch_starts[patch] : patch_starts[patch + 1]]
             matrix[np.ix_(order, members)] = bits[:, patch, : len(members)]
+    x, lowest_node, shift, *others = fields
     return ContactSearch(
-        *fields[:3], fields[3:], corners, barycentric, spacing, search_skin, reach, search_interval, matrix
+        x, lowest_node, shift, tuple(others), corners, barycentric, spacing, search_skin, reach, search_interval, matrix
     )
 
 

@@ -30,8 +30,8 @@ class ModelErrors:
         other: of all other parameters.
         grip_compliance: of parameters of the material, where it is unknown how far grippers hold the cloth. Corners
             that turn as hinges gave E h 0.72 to 0.80 of the truth (``studies strangers``, seeds 10 and 28).
-        contact: of k, gamma and c_F. Layers press by 3 % less or more in another attitude in the grid (``studies fabrics``,
-            20 places and attitudes); so this error occurs in one simulator, too.
+        contact: of k, gamma and c_F. Layers press by 3 % less or more in another attitude in the grid, also of one
+            simulator (``studies fabrics``, 20 places and attitudes).
     """
 
     bending: float = 0.15
