@@ -74,11 +74,11 @@ def mutate_json(rng: Random, data: bytes, limit: int, mutate_bytes: ByteMutation
         return mutate_text(rng, data, limit, mutate_bytes)
     if rng.random() < RAW_SHARE:
         return mutate_text(rng, data, limit, mutate_bytes)
-    for _ in range(_edit_count(rng)):
-        places = list(_places(tree))
-        if places:
-            _edit_json(rng, *rng.choice(places), rng.choice(places))
     try:
+        for _ in range(_edit_count(rng)):
+            places = list(_places(tree))
+            if places:
+                _edit_json(rng, *rng.choice(places), rng.choice(places))
         changed = json.dumps(tree, separators=(",", ":")).encode("utf-8", "surrogatepass")
     except (ValueError, RecursionError):
         return data
@@ -86,10 +86,13 @@ def mutate_json(rng: Random, data: bytes, limit: int, mutate_bytes: ByteMutation
 
 
 def _places(node: Any) -> Iterator[tuple[Any, Any]]:
-    """Every container of a JSON tree with each of its keys."""
-    for key in list(node) if isinstance(node, dict) else range(len(node)) if isinstance(node, list) else ():
-        yield node, key
-        yield from _places(node[key])
+    """Every container of a JSON tree with each of its keys; a tree may be deeper than Python's stack."""
+    waiting = [node]
+    while waiting:
+        node = waiting.pop()
+        for key in list(node) if isinstance(node, dict) else range(len(node)) if isinstance(node, list) else ():
+            yield node, key
+            waiting.append(node[key])
 
 
 def _edit_json(rng: Random, node: Any, key: Any, donor: tuple[Any, Any]) -> None:
