@@ -11,6 +11,7 @@ import warnings
 import zipfile
 from collections.abc import Iterator
 from contextlib import closing
+from itertools import islice
 from random import Random
 from typing import Any
 from zlib import crc32
@@ -76,7 +77,9 @@ def mutate_json(rng: Random, data: bytes, limit: int, mutate_bytes: ByteMutation
         return mutate_text(rng, data, limit, mutate_bytes)
     try:
         for _ in range(_edit_count(rng)):
-            places = list(_places(tree))
+            places = list(islice(_places(tree), limit + 1))
+            if len(places) > limit:  # copies of copies grow without bound
+                return data
             if places:
                 _edit_json(rng, *rng.choice(places), rng.choice(places))
         changed = json.dumps(tree, separators=(",", ":")).encode("utf-8", "surrogatepass")
