@@ -70,7 +70,8 @@ def check_array(
         raise RecordingError(
             f"{place} has the wrong shape", got=list(data.shape), expected=f"[{', '.join(map(str, shape))}]"
         )
-    data = data.astype(dtype)
+    with np.errstate(invalid="ignore"):  # of a signalling NaN, which is refused below
+        data = data.astype(dtype)
     bad = ~(np.abs(data) < MAX_FINITE_VALUE) if kind == "float" else np.zeros(data.shape, dtype=bool)
     bad &= ~(np.isnan(data) & nan)
     if bad.any():
