@@ -13,10 +13,11 @@ from torchcloth.diagnosis import build_base_model, read_model, save_model
 from torchcloth.diagnosis.causes.fabric import change_moduli
 from torchcloth.episodes.recorded_cloth import build_cloth
 from torchcloth.episodes.world import World
+from torchcloth.errors import RecordingError
 from torchcloth.robots import replay  # pyright: ignore[reportMissingImports] - mapped from robots/ at installation
 
-GAP_M = 0.02
-PLAIN = sheet_episodes.make_episode(resolution=(9, 9))
+GAP_M = 0.012
+PLAIN = sheet_episodes.make_episode(resolution=(13, 13))
 
 
 def with_layers(**nominal):
@@ -38,6 +39,12 @@ def test_the_data_sheet_may_know_contact_and_friction_of_layers():
     material = build_cloth(with_layers(contact_stiffness=4e4, shear_stiffness=5e3, cone=0.5)).material
     names = ("contact_stiffness", "shear_stiffness", "cone")
     assert [float(getattr(material, name).value) for name in names] == pytest.approx([4e4, 5e3, 0.5])
+
+
+def test_a_gap_at_which_layers_cannot_meet_is_refused():
+    """Reported by a reader: on a small sheet the gap did nothing, and nothing said so."""
+    with pytest.raises(RecordingError, match=r"layer_gap; got 60 mm, at which layers of this cloth cannot meet"):
+        build_cloth(replace(PLAIN, cloth=replace(PLAIN.cloth, layer_gap=0.06)))
 
 
 @pytest.mark.parametrize("changes", [{"weft": 0.2}, {"stiffening": 5.0}])

@@ -46,7 +46,7 @@ def build_cloth(
         contact: between layers; None: as the episode's ``layer_gap`` says, without which layers do not touch.
 
     Raises:
-        RecordingError: the episode has neither mesh nor sheet.
+        RecordingError: the episode has neither mesh nor sheet, or layers cannot meet at its ``layer_gap``.
         InvalidInput: parts that do not fit each other.
     """
     mesh = build_mesh(recording)
@@ -71,10 +71,25 @@ def build_cloth(
     for name, grasp in recording.grasps.items():
         vertices = None if grasp.vertices is None else grasp.vertices.tolist()
         boundaries[name] = Grasp(vertices) if grasp.uv is None else Grasp(uv=grasp.uv, radius=grasp.radius)
-    density, gap = recording.cloth.areal_density, recording.cloth.layer_gap
-    if contact is None and gap is not None:
-        contact = Contact.with_gap(gap)
+    density = recording.cloth.areal_density
+    contact = _contact_of_layers(recording, mesh) if contact is None else contact
     return Cloth(mesh, material or build_material(recording), density, effects, boundaries, contact)
+
+
+def _contact_of_layers(recording: Recording, mesh: Mesh) -> Contact | None:
+    gap = recording.cloth.layer_gap
+    if gap is None:
+        return None
+    contact = Contact.with_gap(gap)
+    grid = contact.build_grid(mesh)
+    if not grid.can_act:
+        raise RecordingError(
+            f"{recording.path}: cloth.layer_gap",
+            got=f"{1e3 * gap:g} mm, at which layers of this cloth cannot meet ({grid.summary})",
+            expected="a gap at which they can",
+            remedy="give a smaller gap, a mesh of smaller triangles, or leave it out",
+        )
+    return contact
 
 
 def build_mesh(recording: Recording) -> Mesh:

@@ -120,7 +120,7 @@ class Grid(NamedTuple):
             yield (
                 f"contact: edges of some {1e3 * mesh.coarse_edge:.3g} mm take {len(self.points)} points in each "
                 f"triangle near another layer, and each costs as much as a triangle ({self.summary}): give the mesh "
-                "more triangles, or contact=Contact.with_gap(...) a larger gap"
+                "more triangles, or a larger gap (layer_gap of an episode, contact=Contact.with_gap(...))"
             )
         pairs = self.find_layers(mesh)
         if self.non_adjacent is None or not len(pairs):
@@ -130,8 +130,8 @@ class Grid(NamedTuple):
         if unseen_fraction > WARN_UNSEEN_LAYER_FRACTION:
             yield (
                 f"contact: {100 * unseen_fraction:.0f} % of the triangles that lie over another layer do not see it "
-                f"and pass through ({self.summary}): give contact=Contact.with_gap(...) a smaller gap, or the mesh "
-                "more triangles"
+                f"and pass through ({self.summary}): give a smaller gap "
+                "(layer_gap of an episode, contact=Contact.with_gap(...)), or the mesh more triangles"
             )
 
 
