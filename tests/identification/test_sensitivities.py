@@ -145,9 +145,9 @@ def test_where_nothing_can_be_simulated_ahead_secants_go_back(short, monkeypatch
     simulated = problem._simulate_fabrics
     steps = 1e-4 * torch.tensor([min(1.0, abs(u.value(u.start))) for u in unknowns])
 
-    def within(raw, fabrics, i):
+    def within(raw, fabrics, i, dt):
         is_open = [open_to == "back" and bool((fabric <= problem.start).all()) for fabric in fabrics]
-        pairs = zip(is_open, simulated(raw, fabrics, i), strict=True)
+        pairs = zip(is_open, simulated(raw, fabrics, i, dt), strict=True)
         return [frames if can_be_simulated else None for can_be_simulated, frames in pairs]
 
     monkeypatch.setattr(problem, "_simulate_fabrics", within)
