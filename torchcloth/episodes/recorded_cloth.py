@@ -72,24 +72,18 @@ def build_cloth(
         vertices = None if grasp.vertices is None else grasp.vertices.tolist()
         boundaries[name] = Grasp(vertices) if grasp.uv is None else Grasp(uv=grasp.uv, radius=grasp.radius)
     density = recording.cloth.areal_density
-    contact = _contact_of_layers(recording, mesh) if contact is None else contact
-    return Cloth(mesh, material or build_material(recording), density, effects, boundaries, contact)
-
-
-def _contact_of_layers(recording: Recording, mesh: Mesh) -> Contact | None:
-    gap = recording.cloth.layer_gap
-    if gap is None:
-        return None
-    contact = Contact.with_gap(gap)
-    grid = contact.build_grid(mesh)
-    if not grid.can_act:
+    gap = recording.cloth.layer_gap if contact is None else None
+    contact = contact if gap is None else Contact.with_gap(gap)
+    cloth = Cloth(mesh, material or build_material(recording), density, effects, boundaries, contact)
+    grid = cloth.contact_grid()
+    if gap is not None and grid is not None and not grid.can_act:
         raise RecordingError(
             f"{recording.path}: cloth.layer_gap",
             got=f"{1e3 * gap:g} mm, at which layers of this cloth cannot meet ({grid.summary})",
             expected="a gap at which they can",
             remedy="give a smaller gap, a mesh of smaller triangles, or leave it out",
         )
-    return contact
+    return cloth
 
 
 def build_mesh(recording: Recording) -> Mesh:

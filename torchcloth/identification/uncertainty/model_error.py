@@ -15,8 +15,7 @@ import torch
 from torch import Tensor
 
 from ...episodes.unknowns import Unknown
-
-CONTACT_PARAMETERS = ("contact_stiffness", "shear_stiffness", "cone")
+from ...materials.director import DirectorMaterial
 
 
 @dataclass(frozen=True)
@@ -42,7 +41,7 @@ class ModelErrors:
     def of(self, unknown: Unknown, has_unknown_grips: bool) -> float:
         """Return the relative standard deviation of a parameter."""
         error = self.bending if unknown.name.startswith("bending") else self.other
-        if unknown.name in CONTACT_PARAMETERS:
+        if unknown.name in DirectorMaterial.contact_parameters:
             error = math.hypot(error, self.contact)
         is_material = unknown.key.startswith("material.")
         return math.hypot(error, self.grip_compliance) if has_unknown_grips and is_material else error

@@ -134,25 +134,9 @@ def press_of_layers(fast: bool) -> Outcome:
         compression, pressure = np.array(measured).T
         off = np.abs(compression - compression_at(torch.as_tensor(gaps)).numpy()).max()
         rows.append(Row(f"largest error of the compression, {label}", float(off), 0.0, "", absolute(0.01)))
-        ratio = pressure / expected
-        rows.append(
-            Row(
-                f"smallest pressure over that of the closed form, {label}",
-                float(ratio.min()),
-                1.0,
-                "",
-                relative(tolerance),
-            )
-        )
-        rows.append(
-            Row(
-                f"largest pressure over that of the closed form, {label}",
-                float(ratio.max()),
-                1.0,
-                "",
-                relative(tolerance),
-            )
-        )
+        ratio, what = pressure / expected, f"pressure over that of the closed form, {label}"
+        for extreme, value in (("smallest", ratio.min()), ("largest", ratio.max())):
+            rows.append(Row(f"{extreme} {what}", float(value), 1.0, "", relative(tolerance)))
         data |= {name: pressure, f"{name}_gap": gaps}
     note = f"{len(gaps)} places each, at gaps of 0.6 to 1.2 spacings. The grid lies elsewhere in every substep."
     return Outcome(rows, data, note)
